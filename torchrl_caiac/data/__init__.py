@@ -1,0 +1,3 @@
+"""Collecting, loading and storing demonstrations."""
+
+from __future__ import annotations

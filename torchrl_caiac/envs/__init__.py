@@ -1,0 +1,3 @@
+"""Simulated environments and their scripted experts."""
+
+from __future__ import annotations

@@ -1,0 +1,3 @@
+"""Losses, and the fitting of world models."""
+
+from __future__ import annotations

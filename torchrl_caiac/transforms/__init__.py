@@ -1,0 +1,3 @@
+"""Replay-buffer transforms that make counterfactual samples."""
+
+from __future__ import annotations
