@@ -1,0 +1,70 @@
+# Everything runs in .venv, which `make setup` fills with the pins of constraints.txt.
+PYTHON ?= python3
+WORKERS ?= 2
+DEVICE ?= cpu
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.setup-done
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+.PHONY: help setup test lint demo bench docs clean
+
+# A stamp without its interpreter (moved folder, removed Python) does not count.
+ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
+.PHONY: $(STAMP)
+endif
+
+help: ## show this list
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) \
+	    | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
+
+setup: $(STAMP) ## create .venv and install everything at its pin (about 6 GB)
+
+$(STAMP): pyproject.toml constraints.txt
+	@rm -f $(STAMP)
+	@command -v $(PYTHON) >/dev/null || { \
+	    echo "error: '$(PYTHON)' was not found. Install Python 3.10 or later, or" \
+	         "name one: make PYTHON=/path/to/python3 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+	    echo "error: Python 3.10 or later is needed, '$(PYTHON)' is" \
+	         "$$($(PYTHON) --version 2>&1). Name another one:" \
+	         "make PYTHON=/path/to/python3 ..." >&2; exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { \
+	    $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	        echo "error: '$(PYTHON)' cannot create virtual environments: its venv" \
+	             "or ensurepip module is missing. On Debian and Ubuntu:" \
+	             "apt-get install python3-venv" >&2; exit 1; }; \
+	    echo "creating $(VENV)"; $(PYTHON) -m venv --clear $(VENV); }
+	@echo "installing the pinned packages (minutes on the first run)"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all]'
+	@touch $(STAMP)
+
+test: setup ## run all tests and the docstrings' examples
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
+
+lint: setup ## check style, formatting, spelling and types
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/codespell
+	$(BIN)/python -m mypy
+
+demo: setup ## the motivating experiment in the kitchen (QUICK=1: a smoke run)
+	$(BIN)/python examples/franka_kitchen/demo.py $(if $(QUICK),quick=true)
+
+bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --benchmark-only \
+	    --device=$(DEVICE) --benchmark-json=benchmark-$(DEVICE).json
+
+docs: setup ## build the documentation, warnings are errors
+	MPLBACKEND=agg OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going \
+	    -b html docs docs/_build/html
+
+clean: ## remove what was built and cached; .venv and outputs stay
+	rm -rf build dist *.egg-info docs/_build docs/auto_tutorials \
+	    docs/reference/generated docs/sg_execution_times.rst \
+	    .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache benchmark-*.json
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

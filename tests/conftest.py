@@ -1,0 +1,132 @@
+"""Fixtures that all tests share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+FLAT_LENGTHS = (7, 12, 9, 5)
+STATE_WIDTH, ACTION_WIDTH, GOAL_WIDTH = 9, 2, 4
+
+
+def pytest_configure() -> None:
+    """Tests share the machine with each other: one thread each."""
+    torch.set_num_threads(1)
+
+
+def pytest_collection_modifyitems(
+    config: pytest.Config, items: list[pytest.Item]
+) -> None:
+    """Leaves tests that are marked ``gpu`` out where there is no CUDA device."""
+    if torch.cuda.is_available():
+        return
+    without = [item for item in items if item.get_closest_marker("gpu")]
+    if without:
+        config.hook.pytest_deselected(items=without)
+        items[:] = [item for item in items if not item.get_closest_marker("gpu")]
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    """A seeded source of random numbers."""
+    return torch.Generator().manual_seed(0)
+
+
+def _walks(width: int, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
+    """States and next states ``[T, width]``, lengths as in ``FLAT_LENGTHS``."""
+    walks = [
+        torch.randn(n + 1, width, generator=generator).cumsum(0) for n in FLAT_LENGTHS
+    ]
+    return torch.cat([w[:-1] for w in walks]), torch.cat([w[1:] for w in walks])
+
+
+def _ends() -> torch.Tensor:
+    """True in the last row of every trajectory, ``[T, 1]``."""
+    ends = torch.zeros(sum(FLAT_LENGTHS), 1, dtype=torch.bool)
+    ends[torch.tensor(FLAT_LENGTHS).cumsum(0) - 1] = True
+    return ends
+
+
+def _common(generator: torch.Generator) -> dict[str, object]:
+    rows = sum(FLAT_LENGTHS)
+    return {
+        "action": torch.rand(rows, ACTION_WIDTH, generator=generator) * 2 - 1,
+        "episode": torch.repeat_interleave(
+            torch.arange(len(FLAT_LENGTHS)), torch.tensor(FLAT_LENGTHS)
+        ),
+    }
+
+
+def _flags(generator: torch.Generator) -> dict[str, torch.Tensor]:
+    ends = _ends()
+    return {
+        "reward": torch.rand(len(ends), 1, generator=generator),
+        "done": ends,
+        "truncated": ends.clone(),
+        "terminated": torch.zeros_like(ends),
+    }
+
+
+def _stored(data: TensorDict, kind: str, path: Path) -> TensorDictBase:
+    return data.memmap(path / "data") if kind == "memmap" else data
+
+
+@pytest.fixture(params=["memory", "memmap"])
+def storage_kind(request: pytest.FixtureRequest) -> str:
+    """Where the data of ``flat_data`` and ``nested_data`` lie."""
+    return request.param
+
+
+@pytest.fixture
+def flat_data(
+    storage_kind: str, generator: torch.Generator, tmp_path: Path
+) -> TensorDictBase:
+    """Four short trajectories of random walks, rows ``[33]``, flat observations.
+
+    Next observations are those of the following row, also in the goals, which mirror
+    the observation columns 3, 4 and 6, 7.
+    """
+    now, after = _walks(STATE_WIDTH, generator)
+    mirrored = [3, 4, 6, 7]
+    data = TensorDict(
+        {
+            "observation": now,
+            "achieved_goal": now[:, mirrored],
+            "desired_goal": torch.randn(len(now), GOAL_WIDTH, generator=generator),
+            **_common(generator),
+            "next": {
+                "observation": after,
+                "achieved_goal": after[:, mirrored],
+                **_flags(generator),
+            },
+        },
+        [len(now)],
+    )
+    return _stored(data, storage_kind, tmp_path)
+
+
+@pytest.fixture
+def nested_data(
+    storage_kind: str, generator: torch.Generator, tmp_path: Path
+) -> TensorDictBase:
+    """The same kind of trajectories with one leaf or sub-tensordict per entity."""
+    now, after = _walks(STATE_WIDTH, generator)
+
+    def tree(state: torch.Tensor) -> dict[str, object]:
+        return {
+            "arm": state[:, :3].clone(),
+            "kettle": {"position": state[:, 3:6].clone(), "tilt": state[:, 6:9].clone()},
+        }
+
+    data = TensorDict(
+        {
+            "observation": tree(now),
+            **_common(generator),
+            "next": {"observation": tree(after), **_flags(generator)},
+        },
+        [len(now)],
+    ).auto_batch_size_(1)
+    return _stored(data, storage_kind, tmp_path)

@@ -1,0 +1,138 @@
+"""What the installed package promises: what it imports, names and documents."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchrl_caiac
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[1]
+# A room is the package itself, a sub-package, or a public module beside them.
+ROOMS = ["torchrl_caiac"] + sorted(
+    f"torchrl_caiac.{module.name}"
+    for module in pkgutil.iter_modules(torchrl_caiac.__path__)
+    if module.name != "entities"  # the package's own names
+)
+PUBLIC = [
+    (room, name) for room in ROOMS for name in importlib.import_module(room).__all__
+]
+# None of these may be needed to import the core.
+OPTIONAL = (
+    "gymnasium",
+    "gymnasium_robotics",
+    "h5py",
+    "hydra",
+    "matplotlib",
+    "minari",
+    "mujoco",
+    "omegaconf",
+    "PIL",
+    "scipy",
+    "sklearn",
+    "tensorboard",
+    "wandb",
+)
+CORE = (
+    "torchrl_caiac",
+    "torchrl_caiac.data",
+    "torchrl_caiac.influence",
+    "torchrl_caiac.modules",
+    "torchrl_caiac.objectives",
+    "torchrl_caiac.transforms",
+)
+
+
+def test_core_imports_without_extras() -> None:
+    code = (
+        "import sys\n"
+        f"sys.modules.update(dict.fromkeys({OPTIONAL!r}))\n"  # None: not to be had
+        + "".join(f"import {module}\n" for module in CORE)
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+
+
+def test_version_is_that_of_the_project_file() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert importlib.metadata.version("torchrl-caiac") == project["version"]
+    assert f"[{project['version']}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_installed_packages_are_at_their_pins() -> None:
+    """A constraints file that does not match what runs here would prove nothing."""
+    from packaging.requirements import Requirement
+
+    pins = [
+        Requirement(line)
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]
+    wrong = {}
+    for pin in pins:
+        if pin.marker is not None and not pin.marker.evaluate():
+            continue
+        try:
+            found = importlib.metadata.version(pin.name)
+        except importlib.metadata.PackageNotFoundError:
+            continue  # not on this platform
+        if not pin.specifier.contains(found, prereleases=True):
+            wrong[pin.name] = (found, str(pin.specifier))
+    assert not wrong
+
+
+def test_all_extra_names_every_other_extra() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    (everything,) = extras["all"]
+    named = set(re.search(r"\[(.*)\]", everything)[1].split(","))
+    assert named == set(extras) - {"all"}
+
+
+def test_package_is_typed() -> None:
+    assert (Path(torchrl_caiac.__file__).parent / "py.typed").is_file()
+
+
+@pytest.mark.parametrize(("room", "name"), PUBLIC)
+def test_public_names_have_a_docstring(room: str, name: str) -> None:
+    thing = getattr(importlib.import_module(room), name)
+    if not (inspect.isclass(thing) or inspect.isroutine(thing)):
+        return  # a constant: described where it is defined
+    doc = inspect.getdoc(thing) or ""
+    assert len(doc) > 20, f"{room}.{name} has no docstring"
+    own = [n for n, v in vars(thing).items() if inspect.isfunction(v)] if (
+        inspect.isclass(thing)
+    ) else []
+    bare = [
+        n for n in own if not n.startswith("_") and not inspect.getdoc(getattr(thing, n))
+    ]
+    assert not bare, f"{room}.{name} has public methods without docstring: {bare}"
+
+
+def test_reference_lists_every_room() -> None:
+    """The names within a room come from its ``__all__``, see docs/_templates."""
+    text = (ROOT / "docs" / "reference" / "index.rst").read_text()
+    listed = re.findall(r"^   (torchrl_caiac[\w.]*)$", text, flags=re.MULTILINE)
+    assert sorted(listed) == sorted(ROOMS)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_all_is_sorted_and_resolves(room: str) -> None:
+    module = importlib.import_module(room)
+    assert module.__all__ == sorted(module.__all__)
+    assert not [name for name in module.__all__ if not hasattr(module, name)]
