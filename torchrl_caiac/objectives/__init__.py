@@ -1,3 +1,9 @@
 """Losses, and the fitting of world models."""
 
 from __future__ import annotations
+
+from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss
+from torchrl_caiac.objectives.fit_world_model import fit_world_model
+from torchrl_caiac.objectives.lmp import LMPLoss
+
+__all__ = ["EntityDynamicsLoss", "LMPLoss", "fit_world_model"]

@@ -1,0 +1,381 @@
+"""Tests of fitting a world model: learning, splitting, and exact resume."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss
+from torchrl_caiac.objectives.fit_world_model import fit_world_model
+
+module = importlib.import_module("torchrl_caiac.objectives.fit_world_model")
+LAYOUT = EntityLayout({"arm": [0, 1], "cup": [2, 3]})
+
+
+def world(rows: int = 2000, *, seed: int = 0, dtype: Any = torch.float32) -> TensorDict:
+    """An arm that follows the action and moves the cup where it touches it."""
+    generator = torch.Generator().manual_seed(seed)
+    observation = torch.rand(rows, 4, generator=generator, dtype=dtype) * 2 - 1
+    action = torch.rand(rows, 2, generator=generator, dtype=dtype) * 2 - 1
+    touches = (observation[:, :1] - observation[:, 2:3]).abs() < 0.3
+    change = 0.1 * torch.cat([action, action * touches], 1)
+    noise = 1e-3 * torch.randn(rows, 4, generator=generator, dtype=dtype)
+    return TensorDict(
+        {
+            "observation": observation,
+            "action": action,
+            "episode": torch.arange(rows) // 20,
+            "next": {"observation": observation + change + noise},
+        },
+        [rows],
+    )
+
+
+def make(**kwargs: Any) -> GaussianWorldModel:
+    torch.manual_seed(0)
+    return GaussianWorldModel(LAYOUT, 2, kwargs.pop("hidden_sizes", (32, 32)), **kwargs)
+
+
+def fit(model: GaussianWorldModel, data: Any, **kwargs: Any) -> TensorDict:
+    settings = {"steps": 60, "batch_size": 32, "eval_every": 20, "progress": False}
+    return fit_world_model(model, data, **{**settings, **kwargs})
+
+
+def assert_equal(a: GaussianWorldModel, b: GaussianWorldModel) -> None:
+    left, right = a.state_dict(), b.state_dict()
+    assert left.keys() == right.keys()
+    for key, value in left.items():
+        same = value == right[key]
+        assert bool(same.all() if isinstance(value, torch.Tensor) else same), key
+
+
+def test_learns_the_dynamics_and_where_the_cup_moves() -> None:
+    data, model = world(4000), make(hidden_sizes=(64, 64))
+    history = fit(model, data, steps=800, eval_every=200, batch_size=256, lr=3e-3)
+    assert history["step"].tolist() == [200, 400, 600, 800]
+    mse = history["validation_mse"][-1]
+    assert mse["arm"] < 2e-5 and mse["cup"] < 5e-4  # of 0.0033 and about 0.001
+    assert history["validation_nll"][-1] < history["validation_nll"][0]
+    fresh = world(500, seed=1)
+    own = EntityDynamicsLoss(model).entity_mse(fresh)
+    assert own["arm"] < 2e-5 and own["cup"] < 5e-4
+    assert not model.training
+
+
+def test_history_agrees_with_the_loss_on_the_held_out_rows() -> None:
+    data, model = world(), make()
+    history = fit(model, data, steps=40)
+    rows = module._split(data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0))
+    held_out = data[rows[1]]
+    assert len(held_out) == 200
+    assert not set(held_out["episode"].tolist()) & set(
+        data["episode"][rows[0]].tolist()
+    )
+    assert history["best"][-1]
+    loss = EntityDynamicsLoss(model).eval()
+    torch.testing.assert_close(
+        history["validation_nll"][-1].float(), loss(held_out)["loss_nll"].detach()
+    )
+    mse = loss.entity_mse(held_out)
+    for name in LAYOUT.names:
+        torch.testing.assert_close(
+            history["validation_mse", name][-1].float(), mse[name]
+        )
+    reference = make()
+    reference.fit_statistics(data[rows[0]])
+    torch.testing.assert_close(reference.target_scale, model.target_scale)
+
+
+def test_best_step_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = []
+    original = module._Fit.validate
+
+    def validate(self: Any, *args: Any) -> None:
+        original(self, *args)
+        states.append(module._copy(self.model.state_dict()))
+
+    monkeypatch.setattr(module._Fit, "validate", validate)
+    model = make()
+    # A rate this high makes it worse again and again.
+    history = fit(model, world(400), steps=60, eval_every=5, lr=0.2)
+    best = int(history["validation_nll"].argmin())
+    assert best != len(states) - 1
+    assert history["best"].nonzero()[-1].item() == best
+    for key, value in model.state_dict().items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, states[best][key])
+
+
+def test_seeded_and_independent_of_the_global_generator() -> None:
+    data = world(400)
+    one, two, three = make(), make(), make()
+    fit(one, data)
+    torch.manual_seed(123)
+    fit(two, data)
+    fit(three, data, seed=1)
+    assert_equal(one, two)
+    assert not torch.equal(one.loc_head.weight, three.loc_head.weight)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"spectral_norm": True, "target": "absolute"}])
+def test_interrupted_and_resumed_ends_with_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kwargs: Any
+) -> None:
+    data = world(400)
+    reference = make(**kwargs)
+    expected = fit(reference, data)
+    path = tmp_path / "folder" / "fit.ckpt"
+    options: dict[str, Any] = {"checkpoint": path, "checkpoint_every": 25}
+    killed = make(**kwargs)
+    forward = killed.forward_tensors
+    calls = []
+
+    def dies(*args: Any) -> Any:
+        calls.append(1)
+        if len(calls) > 44:
+            raise KeyboardInterrupt
+        return forward(*args)
+
+    monkeypatch.setattr(killed, "forward_tensors", dies)
+    with pytest.raises(KeyboardInterrupt):
+        fit(killed, data, **options)
+    assert [p.name for p in path.parent.iterdir()] == ["fit.ckpt"]
+    # What a kill in the middle of writing leaves is removed by the next call.
+    (path.parent / ".fit.ckpt.partial").write_text("half")
+    (path.parent / "..fit.ckpt.partial.stage-1").mkdir()
+    torch.manual_seed(99)
+    resumed = GaussianWorldModel(LAYOUT, 2, (32, 32), **kwargs)
+    history = fit(resumed, data, **options)
+    assert [p.name for p in path.parent.iterdir()] == ["fit.ckpt"]
+    assert_equal(resumed, reference)
+    assert (history == expected).all()
+    # Finished: the same call does nothing, another number of steps goes on.
+    again = make(**kwargs)
+    before = path.read_bytes()
+    assert (fit(again, data, **options) == expected).all()
+    assert_equal(again, reference)
+    assert path.read_bytes() == before
+    longer, straight = make(**kwargs), make(**kwargs)
+    assert (
+        fit(longer, data, **options, steps=80) == fit(straight, data, steps=80)
+    ).all()
+    assert_equal(longer, straight)
+    with pytest.raises(ValueError, match="has 80 steps already"):
+        fit(make(**kwargs), data, **options)
+
+
+def test_checkpoints_that_are_refused(tmp_path: Path) -> None:
+    data = world(400)
+    path = tmp_path / "fit.ckpt"
+    fit(make(), data, checkpoint=path)
+    good = path.read_bytes()
+
+    def refused(message: str, td: TensorDict = data, **kwargs: Any) -> None:
+        model = kwargs.pop("model", None) or make()
+        before = module._copy(model.state_dict())
+        with pytest.raises(ValueError, match=message):
+            fit(model, td, checkpoint=path, **kwargs)
+        for key, value in model.state_dict().items():
+            if isinstance(value, torch.Tensor):
+                assert torch.equal(value, before[key])
+
+    for half in (good[: len(good) // 2], b"", b"something else"):
+        path.write_bytes(half)
+        refused("no readable checkpoint.*delete it")
+    damaged = bytearray(good)
+    damaged[len(good) // 2] ^= 255
+    path.write_bytes(damaged)
+    refused("no readable checkpoint")
+    path.unlink()
+    path.mkdir()
+    refused("no readable checkpoint")
+    path.rmdir()
+    from torchrl.checkpoint import Checkpoint
+
+    Checkpoint(fit=torch.nn.Linear(1, 1), format="archive").save(path)
+    refused("no readable checkpoint")
+    path.write_bytes(good)
+    refused("another batch_size, saved 32, now 16", batch_size=16)
+    refused("another seed", seed=3)
+    refused("another rows", world(380))
+    refused("another checksum", world(400, seed=5))
+    refused("another model", model=make(hidden_sizes=(16,)))
+    assert path.read_bytes() == good
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_storages_and_memory_limits_make_no_difference(
+    tmp_path: Path, dtype: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = world(400, dtype=dtype)
+    whole, mapped, streamed = make(), make(), make()
+    expected = fit(whole, data)
+    fit(mapped, data.memmap(tmp_path / "data"))
+    monkeypatch.setattr(module, "_CHUNK", 37)
+    loaded = TensorDict.load_memmap(tmp_path / "data")
+    history = fit(streamed, loaded, max_memory=0)
+    assert_equal(whole, mapped)
+    # The statistics are merged from other chunks, hence the rounding.
+    torch.testing.assert_close(
+        streamed.loc_head.weight, whole.loc_head.weight, atol=1e-4, rtol=1e-4
+    )
+    torch.testing.assert_close(
+        history["validation_nll"], expected["validation_nll"], atol=1e-3, rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("max_memory", [0, 2**30])
+def test_several_data_sets_are_one(max_memory: int) -> None:
+    data = world(400)
+    first, second = data[:120].clone(), data[120:].clone()
+    second["episode"] -= 6  # counts from 0 again
+    one, two = make(), make()
+    fit(one, data)
+    fit(two, [first, second], max_memory=max_memory)
+    assert_equal(one, two)
+
+
+def test_same_trajectory_number_in_two_data_sets_is_two_trajectories() -> None:
+    rows = torch.zeros(3, dtype=torch.int64)
+    td = TensorDict({"episode": rows}, [3])
+    shaped = TensorDict({"episode": rows.unsqueeze(-1) + 7}, [3])
+    assert module._trajectories([td, shaped], "episode").tolist() == [0, 0, 0, 1, 1, 1]
+
+
+@pytest.mark.parametrize("fraction", [0.01, 0.1, 0.5, 0.99])
+def test_split_holds_out_whole_trajectories(fraction: float) -> None:
+    trajectory = torch.randint(0, 13, (300,)).unique(return_inverse=True)[1]
+    train, validation = module._split(
+        trajectory, fraction, 10**6, torch.Generator().manual_seed(0)
+    )
+    assert sorted([*train.tolist(), *validation.tolist()]) == list(range(300))
+    left, right = set(trajectory[train].tolist()), set(trajectory[validation].tolist())
+    assert not left & right and left and right
+    assert len(right) == min(max(1, round(fraction * 13)), 12)
+    _, few = module._split(trajectory, fraction, 5, torch.Generator().manual_seed(0))
+    assert len(few) == 5 and set(few.tolist()) <= set(validation.tolist())
+
+
+def test_nested_keys() -> None:
+    flat = world(200)
+
+    def part(x: torch.Tensor) -> dict[str, Any]:
+        return {"arm": x[:, :2], "cup": {"x": x[:, 2:3], "y": x[:, 3:]}}
+
+    td = TensorDict(
+        {
+            "state": part(flat["observation"]),
+            "agent": {"action": flat["action"]},
+            "meta": {"trajectory": flat["episode"].unsqueeze(-1)},
+            "next": {"state": part(flat["next", "observation"])},
+        },
+        [200],
+    )
+    layout = EntityLayout.from_keys({"arm": ("state", "arm"), "cup": ("state", "cup")})
+    torch.manual_seed(0)
+    model = GaussianWorldModel(
+        layout,
+        2,
+        (32, 32),
+        widths=layout.widths(td),
+        action_key=("agent", "action"),
+    )
+    other = make()
+    history = fit(model, td, trajectory_key=("meta", "trajectory"))
+    expected = fit(other, flat)
+    assert (history == expected).all()
+
+
+def test_statistics_that_the_model_has_are_kept() -> None:
+    model = make()
+    model.fit_statistics(torch.randn(10, 4) * 7)
+    scale = model.target_scale.clone()
+    fit(model, world(400), steps=2)
+    assert torch.equal(model.target_scale, scale)
+
+
+def test_denormals_are_flushed_meanwhile_and_then_as_before() -> None:
+    denormal = torch.tensor([1e-310], dtype=torch.float64)
+    seen = []
+    with module._flushing_denormals(True):
+        seen.append(bool((denormal + denormal).any()))
+    with module._flushing_denormals(False):
+        seen.append(bool((denormal + denormal).any()))
+    assert seen[1] and bool((denormal + denormal).any())
+    if torch.set_flush_denormal(True):
+        assert not seen[0]
+        with module._flushing_denormals(True):
+            pass
+        assert not bool((denormal + denormal).any())
+        torch.set_flush_denormal(False)
+
+
+def test_divergence_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make()
+    with torch.no_grad():
+        model.loc_head.bias[0] = float("nan")
+    with pytest.raises(RuntimeError, match="not finite at step 20"):
+        fit(model, world(200))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"steps": 0}, "steps must be an int of at least 1, got 0"),
+        ({"batch_size": -1}, "batch_size"),
+        ({"eval_every": 0}, "eval_every"),
+        ({"checkpoint_every": 0}, "checkpoint_every"),
+        ({"lr": 0.0}, "lr must be positive"),
+        ({"lr": float("inf")}, "lr must be positive"),
+        ({"validation_fraction": 0.0}, "validation_fraction"),
+        ({"validation_fraction": 1.0}, "validation_fraction"),
+    ],
+)
+def test_wrong_arguments_are_named(kwargs: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit(make(), world(100), **kwargs)
+
+
+def test_wrong_data_are_named(tmp_path: Path) -> None:
+    data = world(100)
+
+    def refused(error: Any, message: str, td: Any) -> None:
+        model = make()
+        path = tmp_path / "refused.ckpt"
+        with pytest.raises(error, match=message):
+            fit(model, td, checkpoint=path)
+        assert not model.fitted and not path.exists()
+
+    refused(ValueError, "have no row", data[:0])
+    refused(ValueError, "have no row", [])
+    refused(ValueError, r"batch size \[10, 10\]", data.reshape(10, 10))
+    refused(ValueError, "single trajectory", data[:20])
+    refused(KeyError, "trajectory key 'episode'", data.exclude("episode"))
+    refused(KeyError, "lack the action 'action'", data.exclude("action"))
+    refused(KeyError, "observation", data.exclude("observation"))
+    refused(KeyError, "next", data.exclude("next"))
+    other = data.clone()
+    other["action"] = torch.zeros(100, 5)
+    refused(ValueError, r"'action' have the shape \[100, 5\].*\[100, 2\]", other)
+    other = data.clone()
+    other["episode"] = torch.zeros(100)
+    refused(ValueError, "'episode' is torch.float32", other)
+    for key, shown in (
+        ("observation", "'observation' is nan for entity 'cup' in row 43"),
+        (("next", "observation"), r"\('next', 'observation'\) is nan for entity 'cup'"),
+    ):
+        other = data.clone()
+        other[key][43, 2] = float("nan")
+        refused(ValueError, shown, other)
+    other = data.clone()
+    other["action"][99, 1] = -float("inf")
+    refused(ValueError, "'action' is -inf in column 1 of row 199", [data, other])
+    shutil.rmtree(tmp_path)

@@ -1,0 +1,554 @@
+"""Fitting a Gaussian world model to stored transitions."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import shutil
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
+from tqdm.auto import tqdm
+
+from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+from torchrl_caiac.objectives.entity_dynamics import gaussian_nll
+
+__all__ = ["fit_world_model"]
+
+_LOGGER = logging.getLogger("torchrl_caiac.fit_world_model")
+_FORMAT = "torchrl_caiac.fit_world_model/1"
+_CHUNK = 65_536  # rows read at once from the data
+_EVAL_ROWS = 4_096  # rows through the network at once in validation
+
+
+def fit_world_model(
+    model: GaussianWorldModel,
+    data: TensorDictBase | Sequence[TensorDictBase],
+    *,
+    steps: int = 100_000,
+    batch_size: int = 500,
+    lr: float = 8e-4,
+    validation_fraction: float = 0.1,
+    trajectory_key: NestedKey = "episode",
+    eval_every: int = 1_000,
+    max_validation_rows: int = 100_000,
+    checkpoint: str | Path | None = None,
+    checkpoint_every: int = 5_000,
+    seed: int = 0,
+    max_memory: int = 2**30,
+    flush_denormal: bool = True,
+    progress: bool = True,
+) -> TensorDict:
+    """Fits a world model by maximum likelihood (paper, A.7).
+
+    Adam on the loss of :class:`EntityDynamicsLoss`, batches drawn with replacement.
+    Whole trajectories are held out for validation, and the model ends with the weights
+    and statistics of the step that had the least negative log likelihood there, in
+    evaluation mode. The scale of the targets is taken from the training trajectories,
+    unless the model has one already.
+
+    With ``checkpoint``, the same call made again goes on where the last one stopped
+    (killed or finished) and ends with the same weights, bit for bit, as one that was
+    never interrupted; a larger ``steps`` goes on further.
+
+    Args:
+        model (GaussianWorldModel): the model, changed in place.
+        data (TensorDictBase or sequence of it): transitions ``[T]``, in memory or
+            memmap. Trajectories of several data sets are told apart.
+
+    Keyword Args:
+        steps (int): gradient steps in total. Defaults to 100 000.
+        batch_size (int): rows a step. Defaults to 500.
+        lr (float): learning rate. Defaults to 8e-4.
+        validation_fraction (float): the share of the trajectories that is held out, at
+            least one. Defaults to 0.1.
+        trajectory_key (NestedKey): the number of each row's trajectory, integers
+            ``[T]``. Defaults to ``"episode"``.
+        eval_every (int): steps between two validations. Defaults to 1 000.
+        max_validation_rows (int): validate on a fixed random choice of so many rows
+            where more are held out. Defaults to 100 000.
+        checkpoint (path, optional): a file to keep the state in, replaced atomically.
+        checkpoint_every (int): steps between two checkpoints. Defaults to 5 000.
+        seed (int): of the split and the batches. Defaults to 0.
+        max_memory (int): bytes up to which the needed columns are copied to one block
+            of memory; beyond, each batch reads the data. Defaults to 1 GiB.
+        flush_denormal (bool): treat denormal numbers as zero meanwhile, which can
+            halve a step's time on a CPU. Defaults to ``True``.
+        progress (bool): show a progress bar. Defaults to ``True``.
+
+    Returns:
+        TensorDict: one row per validation, ``[E]``: ``"step"``; ``"train_nll"``, the
+        mean over the steps since the last one; ``"validation_nll"``; ``"best"``, true
+        where the validation was the best so far (the last such row is the model's);
+        and ``("validation_mse", <entity>)``, in squared physical units.
+
+    Raises:
+        KeyError: a key is missing in the data.
+        ValueError: an argument is out of range; the data are empty, hold NaN or
+            infinities, do not fit the model, or have fewer than two trajectories; the
+            checkpoint is truncated, foreign, or of other settings or data.
+        RuntimeError: the loss is no longer finite.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+        >>> from torchrl_caiac.objectives.fit_world_model import fit_world_model
+        >>> observation, action = torch.randn(200, 2), torch.randn(200, 1)
+        >>> td = TensorDict(
+        ...     {
+        ...         "observation": observation,
+        ...         "action": action,
+        ...         "episode": torch.arange(200) // 10,
+        ...         "next": {"observation": observation + 0.1 * action},
+        ...     },
+        ...     [200],
+        ... )
+        >>> model = GaussianWorldModel(EntityLayout({"arm": [0], "cup": [1]}), 1, (16,))
+        >>> history = fit_world_model(
+        ...     model, td, steps=40, eval_every=20, batch_size=32, progress=False
+        ... )
+        >>> history["step"], history["validation_mse", "cup"].shape
+        (tensor([20, 40]), torch.Size([2]))
+    """
+    for name, value in (
+        ("steps", steps),
+        ("batch_size", batch_size),
+        ("eval_every", eval_every),
+        ("max_validation_rows", max_validation_rows),
+        ("checkpoint_every", checkpoint_every),
+    ):
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
+    if not (lr > 0 and math.isfinite(lr)):
+        raise ValueError(f"lr must be positive and finite, got {lr!r}")
+    if not 0 < validation_fraction < 1:
+        raise ValueError(
+            f"validation_fraction must lie between 0 and 1, got {validation_fraction!r}"
+        )
+    sources = [data] if isinstance(data, TensorDictBase) else list(data)
+    rows = _Rows(model, sources, max_memory)
+    generator = torch.Generator().manual_seed(seed)
+    train, validation = _split(
+        _trajectories(sources, unravel_key(trajectory_key)),
+        validation_fraction,
+        max_validation_rows,
+        generator,
+    )
+    settings = {
+        "model": model.config,
+        "rows": rows.lengths,
+        "checksum": rows.checksum,
+        "batch_size": batch_size,
+        "lr": lr,
+        "validation_fraction": validation_fraction,
+        "trajectory_key": str(unravel_key(trajectory_key)),
+        "eval_every": eval_every,
+        "max_validation_rows": max_validation_rows,
+        "seed": seed,
+    }
+    fit = _Fit(model, lr, generator, settings)
+    path = None if checkpoint is None else Path(checkpoint).expanduser().absolute()
+    if path is not None:
+        _clean(path)
+    if path is not None and path.exists():
+        fit.load(path)
+        if fit.step > steps:
+            raise ValueError(
+                f"the checkpoint {path} has {fit.step} steps already, more than "
+                f"steps={steps}: raise steps, or give another path"
+            )
+        _LOGGER.info("going on at step %d of %s", fit.step, path)
+    elif not model.fitted:
+        model.fit_statistics(rows.raw_targets(train))
+    saved = fit.step if path is not None and path.exists() else -1
+
+    model.train()
+    bar = tqdm(
+        total=steps,
+        initial=fit.step,
+        disable=not progress,
+        desc="world model",
+        unit="step",
+    )
+    with bar, _flushing_denormals(flush_denormal):
+        while fit.step < steps:
+            choice = torch.randint(len(train), (batch_size,), generator=generator)
+            state, action, raw = rows.get(train[choice])
+            loc, var = model.forward_tensors(state, action)
+            loss = gaussian_nll(loc, var, model.normalise(raw)).mean()
+            fit.optimizer.zero_grad()
+            loss.backward()
+            fit.optimizer.step()
+            fit.step += 1
+            fit.train_sum += loss.detach().double()
+            fit.train_count += 1
+            bar.update()
+            if fit.step % eval_every == 0 or fit.step == steps:
+                fit.validate(rows, validation)
+                bar.set_postfix(
+                    nll=f"{fit.history[-1]['validation_nll']:.3f}",
+                    best=f"{fit.best_nll:.3f}",
+                )
+            if path is not None and fit.step % checkpoint_every == 0:
+                fit.save(path)
+                saved = fit.step
+    if path is not None and saved != fit.step:
+        fit.save(path)
+    model.load_state_dict(fit.best)
+    model.eval()
+    return fit.table()
+
+
+class _Rows:
+    """The columns that the model reads, of several data sets, by row number."""
+
+    def __init__(
+        self,
+        model: GaussianWorldModel,
+        sources: Sequence[TensorDictBase],
+        max_memory: int,
+    ) -> None:
+        self.model, self.sources = model, sources
+        for td in sources:
+            if td.batch_dims != 1:
+                raise ValueError(
+                    f"the data have the batch size {list(td.batch_size)}, wanted flat "
+                    "rows [T]: use td.reshape(-1)"
+                )
+        self.lengths = [len(td) for td in sources]
+        total = sum(self.lengths)
+        if not total:
+            raise ValueError("the data have no row: collect or load some first")
+        self.starts = torch.tensor([0, *self.lengths]).cumsum(0)
+        self.sizes = [model.state_dim, model.action_dim, model.predict_dim]
+        width = sum(self.sizes)
+        self.device = model.loc_head.weight.device
+        self.block: torch.Tensor | None = None
+        if total * width * 4 <= max_memory:
+            self.block = torch.empty(total, width)
+        self.checksum = 0
+        for first, part in self._chunks():
+            self.checksum = zlib.crc32(part.numpy().data, self.checksum)
+            if self.block is not None:
+                self.block[first : first + len(part)] = part
+        if self.block is not None:
+            self.block = self.block.to(self.device)
+
+    def _chunks(self) -> Iterator[tuple[int, torch.Tensor]]:
+        model = self.model
+        first = 0
+        for td in self.sources:
+            for start in range(0, len(td), _CHUNK):
+                part = td[start : start + _CHUNK]
+                action = part.get(model.action_key, None)
+                if action is None:
+                    raise KeyError(
+                        f"the data lack the action {model.action_key!r}, they have "
+                        f"{sorted(map(str, part.keys(include_nested=True)))}"
+                    )
+                state = model.layout.read(part)
+                after = model.layout.read(part, next=True)
+                for what, x, size in (
+                    ("the entities' features", state, model.state_dim),
+                    ("the entities' next features", after, model.state_dim),
+                    (f"{model.action_key!r}", action, model.action_dim),
+                ):
+                    if tuple(x.shape) != (len(part), size):
+                        raise ValueError(
+                            f"{what} have the shape {list(x.shape)}, but the model "
+                            f"reads {[len(part), size]}: give the data that the "
+                            "model's layout describes"
+                        )
+                model.check_finite(state, first_row=first)
+                model.check_finite(after, next=True, first_row=first)
+                model.check_finite_action(action, first_row=first)
+                yield first, self._columns(state, action, after)
+                first += len(part)
+
+    def _columns(
+        self, state: torch.Tensor, action: torch.Tensor, after: torch.Tensor
+    ) -> torch.Tensor:
+        # The change is taken before the cast: float64 data keep their small changes.
+        state, action, after = state.cpu(), action.cpu(), after.cpu()
+        index = self.model.index.cpu()
+        raw = after[:, index]
+        if self.model.target == "change":
+            raw = raw - state[:, index]
+        return torch.cat([state.float(), action.float(), raw.float()], 1)
+
+    def get(self, index: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """States, actions and raw targets of some rows, on the model's device."""
+        if self.block is not None:
+            return self.block[index.to(self.device)].split(self.sizes, 1)
+        model, layout = self.model, self.model.layout
+        out = torch.empty(len(index), sum(self.sizes))
+        source = torch.bucketize(index, self.starts[1:], right=True)
+        for number, td in enumerate(self.sources):
+            where = (source == number).nonzero()[:, 0]
+            if len(where):
+                part = td[index[where] - self.starts[number]]
+                out[where] = self._columns(
+                    layout.read(part),
+                    part.get(model.action_key),
+                    layout.read(part, next=True),
+                )
+        return out.to(self.device).split(self.sizes, 1)
+
+    def raw_targets(self, index: torch.Tensor) -> Iterator[torch.Tensor]:
+        """The raw targets of some rows, in chunks."""
+        for part in index.split(_CHUNK):
+            yield self.get(part)[2]
+
+
+class _Fit:
+    """Everything that a fit is resumed from."""
+
+    def __init__(
+        self,
+        model: GaussianWorldModel,
+        lr: float,
+        generator: torch.Generator,
+        settings: dict[str, Any],
+    ) -> None:
+        self.model = model
+        self.optimizer = torch.optim.Adam(model.parameters(), lr=lr)
+        self.generator = generator
+        self.settings = settings
+        self.step = 0
+        self.best: dict[str, Any] = {}
+        self.best_nll = math.inf
+        self.history: list[dict[str, float]] = []
+        self.train_sum = torch.zeros(
+            (), dtype=torch.float64, device=model.loc_head.weight.device
+        )
+        self.train_count = 0
+
+    @torch.no_grad()
+    def validate(self, rows: _Rows, index: torch.Tensor) -> None:
+        """Adds a row to the history, and keeps the model if it is the best."""
+        model = self.model
+        model.eval()
+        nll = torch.zeros((), dtype=torch.float64)
+        error = torch.zeros(model.predict_dim, dtype=torch.float64)
+        for part in index.split(_EVAL_ROWS):
+            state, action, raw = rows.get(part)
+            loc, var = model.forward_tensors(state, action)
+            target = model.normalise(raw)
+            nll += gaussian_nll(loc, var, target).sum(dtype=torch.float64).cpu()
+            error += (target - loc).square().sum(0, dtype=torch.float64).cpu()
+        model.train()
+        # In physical units the error of change and of absolute targets is the same.
+        error *= model.target_scale.cpu().square() / len(index)
+        row = {
+            "step": self.step,
+            "train_nll": (self.train_sum / max(1, self.train_count)).item(),
+            "validation_nll": nll.item() / len(index),
+        }
+        if not all(map(math.isfinite, row.values())):
+            raise RuntimeError(
+                f"the loss is not finite at step {self.step} ({row}): lower lr, or "
+                "raise the model's variance_floor"
+            )
+        for name, where in model.predicted.items():
+            row[f"mse/{name}"] = error[where].mean().item()
+        row["best"] = row["validation_nll"] < self.best_nll
+        if row["best"]:
+            self.best_nll = row["validation_nll"]
+            self.best = _copy(model.state_dict())
+        self.history.append(row)
+        self.train_sum.zero_()
+        self.train_count = 0
+
+    def table(self) -> TensorDict:
+        """The history as a tensordict ``[E]``."""
+
+        def column(name: str, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+            return torch.tensor([row[name] for row in self.history], dtype=dtype)
+
+        return TensorDict(
+            {
+                "step": column("step", torch.int64),
+                "train_nll": column("train_nll"),
+                "validation_nll": column("validation_nll"),
+                "best": column("best", torch.bool),
+                "validation_mse": {
+                    name: column(f"mse/{name}") for name in self.model.predicted
+                },
+            },
+            [len(self.history)],
+        )
+
+    def save(self, path: Path) -> None:
+        """Writes a checkpoint, which replaces the old one when it is whole."""
+        holder = _Holder(
+            {
+                "format": _FORMAT,
+                "settings": json.dumps(self.settings),
+                "step": self.step,
+                "model": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "generator": self.generator.get_state(),
+                "best": self.best,
+                "best_nll": self.best_nll,
+                "history": self.history,
+                "train_sum": self.train_sum,
+                "train_count": self.train_count,
+            }
+        )
+        partial = _partial(path)
+        try:
+            _checkpoint(holder).save(partial, metadata={"content": _FORMAT})
+            os.replace(partial, path)
+        except BaseException:
+            _clean(path)
+            raise
+
+    def load(self, path: Path) -> None:
+        """Restores a checkpoint; when it is refused, nothing has changed."""
+        holder = _Holder({})
+        advice = "delete it to begin anew, or give another path"
+        try:
+            _checkpoint(holder).load(path, map_location="cpu")
+            saved = holder.content
+            found = saved["format"]
+        except Exception as error:
+            raise ValueError(
+                f"{path} is no readable checkpoint of fit_world_model, it may be "
+                f"truncated or foreign ({error}): {advice}"
+            ) from error
+        if found != _FORMAT:
+            raise ValueError(
+                f"the checkpoint {path} is of the format {found!r}, wanted "
+                f"{_FORMAT!r}: {advice}"
+            )
+        settings = json.loads(saved["settings"])
+        wanted = json.loads(json.dumps(self.settings))
+        for name, value in wanted.items():
+            if settings.get(name) != value:
+                raise ValueError(
+                    f"the checkpoint {path} was made with another {name}, saved "
+                    f"{settings.get(name)!r}, now {value!r}: repeat the call as it "
+                    f"was, or {advice}"
+                )
+        self.model.load_state_dict(saved["model"])
+        self.optimizer.load_state_dict(saved["optimizer"])
+        self.generator.set_state(saved["generator"])
+        self.best = saved["best"]
+        self.train_sum.copy_(saved["train_sum"])
+        for name in ("step", "best_nll", "history", "train_count"):
+            setattr(self, name, saved[name])
+
+
+class _Holder:
+    """Hands a dictionary to and from a TorchRL checkpoint, as one component."""
+
+    def __init__(self, content: dict[str, Any]) -> None:
+        self.content = content
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.content
+
+    def load_state_dict(self, content: dict[str, Any]) -> None:
+        self.content = content
+
+
+def _checkpoint(holder: _Holder) -> Checkpoint:
+    # The tensordicts' own format would give the optimizer views of the file.
+    return Checkpoint(format="archive").register(
+        "fit", holder, adapter=StateDictCheckpointAdapter(payload_format="torch")
+    )
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.name}.partial")
+
+
+def _clean(path: Path) -> None:
+    """Removes what a killed process left beside a checkpoint."""
+    partial = _partial(path)
+    if path.parent.is_dir():
+        for left in [partial, *path.parent.glob(f".{partial.name}.*-*")]:
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+
+
+def _copy(state: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: value.detach().clone() if isinstance(value, torch.Tensor) else value
+        for key, value in state.items()
+    }
+
+
+def _trajectories(sources: Sequence[TensorDictBase], key: NestedKey) -> torch.Tensor:
+    """A number for each row ``[T]``, equal within a trajectory only."""
+    parts: list[torch.Tensor] = []
+    offset = 0
+    for td in sources:
+        ids = td.get(key, None)
+        if ids is None:
+            raise KeyError(
+                f"the data lack the trajectory key {key!r}, they have "
+                f"{sorted(map(str, td.keys(include_nested=True)))}: the validation "
+                "data are whole trajectories, name the key that tells them apart"
+            )
+        if ids.numel() != len(td) or ids.is_floating_point():
+            raise ValueError(
+                f"{key!r} is {ids.dtype} of the shape {list(ids.shape)}, wanted one "
+                f"integer for each of the {len(td)} rows"
+            )
+        _, number = torch.unique(ids.reshape(-1).cpu(), return_inverse=True)
+        parts.append(number + offset)
+        if len(number):
+            offset += int(number.max()) + 1
+    return torch.cat(parts)
+
+
+def _split(
+    trajectory: torch.Tensor,
+    fraction: float,
+    max_validation_rows: int,
+    generator: torch.Generator,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The row numbers for training and for validation, by whole trajectories."""
+    count = int(trajectory.max()) + 1
+    if count < 2:
+        raise ValueError(
+            "the data hold a single trajectory, and validation needs one of its own: "
+            "collect more, or correct trajectory_key"
+        )
+    held_out = min(max(1, round(fraction * count)), count - 1)
+    validates = torch.zeros(count, dtype=torch.bool)
+    validates[torch.randperm(count, generator=generator)[:held_out]] = True
+    mask = validates[trajectory]
+    validation = mask.nonzero()[:, 0]
+    if len(validation) > max_validation_rows:
+        choice = torch.randperm(len(validation), generator=generator)
+        validation = validation[choice[:max_validation_rows]].sort().values
+    return (~mask).nonzero()[:, 0], validation
+
+
+@contextmanager
+def _flushing_denormals(wanted: bool) -> Iterator[None]:
+    """Treats denormal numbers as zero, and then restores the process' setting."""
+    # torch has no getter; a denormal that survives an addition tells.
+    denormal = torch.tensor([1e-310], dtype=torch.float64)
+    already = not bool((denormal + denormal).any())
+    changed = wanted and not already and torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        if changed:
+            torch.set_flush_denormal(False)

@@ -1,0 +1,392 @@
+"""The loss of Latent Motor Plans: reconstruction and a balanced KL divergence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from torchrl_caiac.modules.lmp import LMPModel, gaussian_plan, read_leaf
+
+__all__ = ["LMPLoss", "balanced_kl", "gaussian_kl"]
+
+
+def gaussian_kl(
+    loc_q: Tensor, log_std_q: Tensor, loc_p: Tensor, log_std_p: Tensor
+) -> Tensor:
+    """KL divergence between two diagonal Gaussians, summed over the last dimension.
+
+    Args:
+        loc_q: mean of q, ``[*B, P]``.
+        log_std_q: logarithm of q's standard deviation, ``[*B, P]``.
+        loc_p: mean of p, ``[*B, P]``.
+        log_std_p: logarithm of p's standard deviation, ``[*B, P]``.
+
+    Returns:
+        KL(q || p) in nats, ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> zero = torch.zeros(2)
+        >>> gaussian_kl(torch.ones(2), zero, zero, zero)
+        tensor(1.)
+    """
+    log_ratio = log_std_q - log_std_p
+    distance = (loc_q - loc_p) * torch.exp(-log_std_p)
+    # Variances enter, hence twice the log deviations; expm1 keeps the digits where
+    # both distributions are nearly the same.
+    per_dim = 0.5 * (torch.expm1(2.0 * log_ratio) + distance.square()) - log_ratio
+    return per_dim.sum(-1)
+
+
+def balanced_kl(
+    loc_q: Tensor,
+    log_std_q: Tensor,
+    loc_p: Tensor,
+    log_std_p: Tensor,
+    balance: float | Tensor,
+) -> Tensor:
+    """KL(q || p) whose gradient is split between p and q (paper A.5.1).
+
+    The value is that of :func:`gaussian_kl`; the gradient for p's parameters is
+    ``balance`` times the whole, the one for q's ``1 - balance`` times: early in
+    training the posterior is not drawn towards a prior that knows nothing yet.
+
+    Args:
+        loc_q: mean of q, ``[*B, P]``.
+        log_std_q: logarithm of q's standard deviation, ``[*B, P]``.
+        loc_p: mean of p, ``[*B, P]``.
+        log_std_p: logarithm of p's standard deviation, ``[*B, P]``.
+        balance: share of the gradient that p's parameters get, in [0, 1].
+
+    Returns:
+        KL(q || p) in nats, ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> q = torch.ones(1, requires_grad=True)
+        >>> p = torch.zeros(1, requires_grad=True)
+        >>> zero = torch.zeros(1)
+        >>> balanced_kl(q, zero, p, zero, 0.75).sum().backward()
+        >>> q.grad, p.grad
+        (tensor([0.2500]), tensor([-0.7500]))
+    """
+    for_prior = gaussian_kl(loc_q.detach(), log_std_q.detach(), loc_p, log_std_p)
+    for_posterior = gaussian_kl(loc_q, log_std_q, loc_p.detach(), log_std_p.detach())
+    return balance * for_prior + (1.0 - balance) * for_posterior
+
+
+class LMPLoss(LossModule):
+    """Loss of Latent Motor Plans on windows (paper A.5.1).
+
+    Every window is encoded by the posterior, a plan is drawn with a reparameterized
+    sample, and the decoder gives the actions back. Two losses come out, to be
+    summed: ``"loss_reconstruction"``, the squared error summed over the actions and
+    averaged over the valid steps, times ``reconstruction_weight``; and
+    ``"loss_kl"``, KL(posterior || prior) times ``kl_weight``, with its gradient
+    balanced between the two. The prior sees a window's first state and first goal.
+
+    The batch holds windows: leaves of shape ``[*B, κ, ...]``. Samples of a
+    ``SliceSampler`` come flat, ``batch.reshape(-1, κ)`` makes windows of them.
+    Windows that are padded at their end carry a bool leaf ``"mask"``, ``[*B, κ]``
+    (or ``[*B, κ, 1]``), True at the valid steps; the masks that TorchRL itself
+    writes (``loss_mask_key``, see ``LossModule``) are honoured too.
+
+    The model is kept as it is (``functional`` is False): the loss's parameters are
+    the model's.
+
+    Args:
+        model: the parts to be trained.
+        kl_weight: weight of the KL divergence; a buffer that can be assigned to.
+        kl_balance: share of the KL's gradient that goes to the prior; a buffer.
+        reconstruction_weight: weight of the squared error; a buffer.
+
+    Keyword Args:
+        reduction: ``"mean"`` or ``"sum"`` over windows, or ``"none"``, which gives
+            ``[*B]``.
+        generator: source of the plans' noise; the global one by default.
+
+    Raises:
+        ValueError: if a weight, the balance or the reduction is out of range.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.modules.lmp import LMPModel
+        >>> model = LMPModel(observation_dim=5, goal_dim=2, action_dim=3, window=10)
+        >>> loss = LMPLoss(model)
+        >>> flat = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(80, 5),
+        ...         "action": torch.rand(80, 3),
+        ...         "desired_goal": torch.randn(80, 2),
+        ...     },
+        ...     batch_size=[80],
+        ... )
+        >>> losses = loss(flat.reshape(-1, 10))
+        >>> sorted(losses.keys())
+        ['kl', 'loss_kl', 'loss_reconstruction', 'mse']
+        >>> (losses["loss_reconstruction"] + losses["loss_kl"]).backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Leaves of the input that can be renamed with ``set_keys``.
+
+        Attributes:
+            observation: states ``[*B, κ, D]``.
+            action: actions ``[*B, κ, A]``.
+            desired_goal: goals ``[*B, κ, G]``; the first row of a window is read.
+            mask: optional, bool ``[*B, κ]`` or ``[*B, κ, 1]``, True where valid.
+        """
+
+        observation: NestedKey = "observation"
+        action: NestedKey = "action"
+        desired_goal: NestedKey = "desired_goal"
+        mask: NestedKey = "mask"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    _schedulable_buffers = frozenset(
+        {"kl_weight", "kl_balance", "reconstruction_weight"}
+    )
+
+    model: LMPModel
+    kl_weight: Tensor
+    kl_balance: Tensor
+    reconstruction_weight: Tensor
+
+    def __init__(
+        self,
+        model: LMPModel,
+        kl_weight: float = 1.0,
+        kl_balance: float = 0.8,
+        reconstruction_weight: float = 2.0,
+        *,
+        reduction: Literal["none", "mean", "sum"] = "mean",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if not kl_weight >= 0.0:
+            raise ValueError(f"kl_weight must be at least 0, found {kl_weight}.")
+        if not 0.0 <= kl_balance <= 1.0:
+            raise ValueError(f"kl_balance must lie in [0, 1], found {kl_balance}.")
+        if not reconstruction_weight >= 0.0:
+            raise ValueError(
+                "reconstruction_weight must be at least 0, found "
+                f"{reconstruction_weight}."
+            )
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(
+                f"reduction must be 'none', 'mean' or 'sum', found {reduction!r}."
+            )
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[NestedKey] | None = None
+        super().__init__()
+        self.model = model
+        self.register_buffer("kl_weight", torch.tensor(float(kl_weight)))
+        self.register_buffer("kl_balance", torch.tensor(float(kl_balance)))
+        self.register_buffer(
+            "reconstruction_weight", torch.tensor(float(reconstruction_weight))
+        )
+        self.reduction = reduction
+        self.generator = generator
+        self.set_keys(
+            observation=model.observation_key,
+            action=model.action_key,
+            desired_goal=model.goal_key,
+            mask=model.mask_key,
+        )
+
+    @property
+    def functional(self) -> bool:
+        """False: the model keeps its parameters."""
+        return False
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The leaves that must be there; the mask is optional and not among them."""
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            self._in_keys = [keys.observation, keys.action, keys.desired_goal]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        self._in_keys = value
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The losses, then the detached values for logs."""
+        if self._out_keys is None:
+            self._out_keys = ["loss_reconstruction", "loss_kl", "kl", "mse"]
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, value: list[NestedKey]) -> None:
+        self._out_keys = value
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes both losses.
+
+        Args:
+            tensordict: windows, ``[*B, κ]``, see the class.
+
+        Returns:
+            A tensordict with ``"loss_reconstruction"``, ``"loss_kl"`` and, detached,
+            ``"kl"`` (without its weight) and ``"mse"`` (the squared error averaged
+            over actions too); scalars, or ``[*B]`` for the reduction ``"none"``.
+
+        Raises:
+            KeyError: if a leaf is missing.
+            ValueError: if a leaf has the wrong shape, windows have another length
+                than the model's, the mask is not True at a window's first steps
+                and False after them, or if states, goals or actions are not finite.
+        """
+        model = self.model
+        observation, action, goal, mask = self._read(tensordict)
+        *batch, window, _ = observation.shape
+
+        encoded = TensorDict(batch_size=batch)
+        encoded.set(model.observation_key, observation)
+        encoded.set(model.action_key, action)
+        if mask is not None:
+            encoded.set(model.mask_key, mask)
+        encoded = model.posterior(encoded)
+        loc_q = encoded.get(model.posterior_loc_key)
+        log_std_q = encoded.get(model.posterior_log_std_key)
+
+        foretold = TensorDict(batch_size=batch)
+        foretold.set(model.observation_key, observation[..., 0, :])
+        foretold.set(model.goal_key, goal[..., 0, :])
+        foretold = model.prior(foretold)
+        loc_p = foretold.get(model.prior_loc_key)
+        log_std_p = foretold.get(model.prior_log_std_key)
+
+        # Losses run in deterministic exploration mode, so the sample is drawn here
+        # and not left to a probabilistic module.
+        noise = torch.randn(
+            loc_q.shape,
+            generator=self.generator,
+            dtype=loc_q.dtype,
+            device=loc_q.device,
+        )
+        decoded = TensorDict(batch_size=batch)
+        decoded.set(model.plan_key, gaussian_plan(loc_q, log_std_q, noise))
+        decoded.set(model.observation_key, observation)
+        decoded = model.decoder(decoded)
+        prediction = decoded.get(model.actions_key)[..., :window, :]
+
+        error = (prediction - action.to(prediction.dtype)).square().sum(-1)
+        if mask is None:
+            error = error.mean(-1)
+        else:
+            error = error.where(mask, torch.zeros_like(error)).sum(-1) / mask.sum(-1)
+        kl = balanced_kl(loc_q, log_std_q, loc_p, log_std_p, self.kl_balance)
+        error, kl = self._reduce(error), self._reduce(kl)
+        if not (error.isfinite().all() and kl.isfinite().all()):
+            self._name_non_finite(observation, action, goal[..., 0, :])
+        return TensorDict(
+            {
+                "loss_reconstruction": self.reconstruction_weight * error,
+                "loss_kl": self.kl_weight * kl,
+                "kl": kl.detach(),
+                "mse": error.detach() / model.action_dim,
+            },
+            batch_size=batch if self.reduction == "none" else [],
+        )
+
+    def _reduce(self, value: Tensor) -> Tensor:
+        if self.reduction == "mean":
+            return value.mean()
+        return value.sum() if self.reduction == "sum" else value
+
+    def _read(
+        self, tensordict: TensorDictBase
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        model, keys = self.model, self.tensor_keys
+        observation = read_leaf(tensordict, keys.observation, model.observation_dim)
+        action = read_leaf(tensordict, keys.action, model.action_dim)
+        goal = read_leaf(tensordict, keys.desired_goal, model.goal_dim)
+        if observation.ndim < 2:
+            raise ValueError(
+                f"{keys.observation!r} has shape {tuple(observation.shape)}, but "
+                f"windows [*B, {model.window}, {model.observation_dim}] are needed: "
+                f"reshape a flat batch with batch.reshape(-1, {model.window})."
+            )
+        rows = observation.shape[:-1]
+        for key, value in ((keys.action, action), (keys.desired_goal, goal)):
+            if value.shape[:-1] != rows:
+                raise ValueError(
+                    f"{key!r} has shape {tuple(value.shape)}, but {keys.observation!r} "
+                    f"has {tuple(observation.shape)}: all dimensions but the last "
+                    "must agree."
+                )
+        if rows.numel() == 0:
+            raise ValueError(
+                f"{keys.observation!r} has shape {tuple(observation.shape)}: the "
+                "batch holds no window."
+            )
+        mask = self._read_mask(tensordict, rows)
+        length = rows[-1]
+        if length > model.window or (length < model.window and mask is None):
+            raise ValueError(
+                f"{keys.observation!r} has shape {tuple(observation.shape)}: windows "
+                f"of {length} steps, but the model was built for {model.window}. "
+                f"Reshape a flat batch with batch.reshape(-1, {model.window}), or pad "
+                f"shorter windows and mark their valid steps in {keys.mask!r}."
+            )
+        if mask is not None:
+            # Padding may hold anything, so it is blanked before it meets a network.
+            blank = ~mask.unsqueeze(-1)
+            observation = observation.masked_fill(blank, 0.0)
+            action = action.masked_fill(blank, 0.0)
+        return observation, action, goal, mask
+
+    def _read_mask(self, tensordict: TensorDictBase, rows: torch.Size) -> Tensor | None:
+        found: Tensor | None = None
+        for key in (self.tensor_keys.mask, *self._loss_mask_keys()):
+            mask = tensordict.get(key, None)
+            if mask is None:
+                continue
+            if mask.dtype != torch.bool or mask.shape not in (rows, (*rows, 1)):
+                raise ValueError(
+                    f"{key!r} has shape {tuple(mask.shape)} and dtype {mask.dtype}, "
+                    f"but a bool mask of shape {tuple(rows)} is needed, True at the "
+                    "valid steps."
+                )
+            mask = mask.reshape(rows)
+            if not mask[..., 0].all() or (mask[..., 1:] & ~mask[..., :-1]).any():
+                raise ValueError(
+                    f"{key!r} must be True at the first steps of every window, at "
+                    "least one, and False after them: only windows padded at their "
+                    "end are supported."
+                )
+            found = mask if found is None else found & mask
+        return found
+
+    def _name_non_finite(
+        self, observation: Tensor, action: Tensor, goal: Tensor
+    ) -> None:
+        """Raises if the input is to blame for a loss that is not finite."""
+        keys = self.tensor_keys
+        for key, value in (
+            (keys.observation, observation),
+            (keys.action, action),
+            (keys.desired_goal, goal),
+        ):
+            count = int((~value.isfinite()).sum())
+            if count:
+                raise ValueError(
+                    f"{key!r} holds {count} non-finite values in a batch of shape "
+                    f"{tuple(value.shape)}: remove or repair these rows in the data."
+                )
