@@ -3,5 +3,8 @@
 from __future__ import annotations
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms import CAIACTransform
 
-__all__ = ["EntityLayout"]
+__all__ = ["CAIACTransform", "EntityLayout"]
+
+__version__ = "0.1.0"

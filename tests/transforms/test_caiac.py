@@ -1,0 +1,854 @@
+"""CAIACTransform against a slow oracle that recomputes what each row may be."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import dataclass
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    SliceSampler,
+    TensorDictReplayBuffer,
+    TensorStorage,
+)
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.transforms import CAIACTransform, WindowGoal
+
+THRESHOLD = 0.25
+# Every value names the row and the column it comes from: row * STRIDE + column.
+STRIDE = 32
+
+FLAT = EntityLayout(
+    {"arm": [0, 4], "cup": [5, 1, 2], "box": [7]},  # columns 3 and 6 are nobody's
+    goal={"cup": [2, 0], "box": [1]},
+    achieved={"cup": [1, 2], "box": [7]},
+    fixed=["arm"],
+)
+FLAT_FREE = EntityLayout({"arm": [0, 4], "cup": [5, 1, 2], "box": [7]})
+NESTED = EntityLayout.from_keys(
+    {"arm": ("state", "arm"), "cup": ("state", "cup"), "box": ("state", "box")},
+    goal={"cup": ("goal", "cup"), "box": None},
+    achieved={"cup": ("got", "cup"), "box": None},
+    fixed=["arm"],
+)
+N = 3
+
+
+def leaf(
+    rows: torch.Tensor, *shape: int, first: int = 0, sign: int = 1
+) -> torch.Tensor:
+    """Values that tell their row and column, negative in next states."""
+    size = math.prod(shape)
+    value = rows.view(-1, 1) * STRIDE + torch.arange(first, first + size)
+    value = value if sign > 0 else -value - 1
+    return value.view(-1, *shape)
+
+
+def make_data(
+    layout: EntityLayout,
+    rows: torch.Tensor,
+    lengths: list[int],
+    generator: torch.Generator,
+    dtype: torch.dtype = torch.float32,
+    goals: bool = True,
+) -> TensorDict:
+    """Rows of trajectories whose every value names its row."""
+    total = len(rows)
+    episode = torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths))
+    end = torch.zeros(total, 1, dtype=torch.bool)
+    end[torch.tensor(lengths).cumsum(0) - 1] = True
+    score = torch.rand(total, N, generator=generator)
+    score[torch.rand(total, N, generator=generator) < 0.6] = 0.0
+    td = TensorDict(
+        {
+            "row": rows,
+            "episode": episode + 10 * int(rows[0] > 0),
+            "action": leaf(rows, 2).to(torch.float32),
+            "next": {
+                "reward": rows.to(torch.float32).unsqueeze(-1),
+                "done": end,
+                "terminated": torch.zeros_like(end),
+                "truncated": end.clone(),
+            },
+            ("caiac", "score"): score,
+        },
+        [total],
+    )
+    for sign, where in ((1, ()), (-1, ("next",))):
+        if layout.is_flat:
+            parts = {"observation": leaf(rows, 8, sign=sign)}
+            if goals:
+                parts["achieved_goal"] = leaf(rows, 3, first=8, sign=sign)
+                parts["desired_goal"] = leaf(rows, 3, first=11, sign=sign)
+        else:
+            parts = {
+                ("state", "arm"): leaf(rows, 2, sign=sign),
+                ("state", "cup", "pos"): leaf(rows, 3, first=2, sign=sign),
+                ("state", "cup", "pose", "rot"): leaf(rows, 2, 2, first=5, sign=sign),
+                ("state", "box"): leaf(rows, first=9, sign=sign),
+            }
+            if goals:
+                parts["got", "cup"] = leaf(rows, 2, first=10, sign=sign)
+                parts["goal", "cup"] = leaf(rows, 2, first=12, sign=sign)
+        for key, value in parts.items():
+            path = (key,) if isinstance(key, str) else key
+            td[(*where, *path)] = value.to(dtype)
+    return td
+
+
+def owner_of(
+    layout: EntityLayout, key: tuple[str, ...]
+) -> list[str | None] | str | None:
+    """Which entity a leaf, or each column of it, must follow."""
+    if key[0] == "next":
+        key = key[1:]
+    if not layout.is_flat:
+        return key[1] if key[0] in ("state", "got", "goal") else None
+    if key == ("observation",):
+        owner: list[str | None] = [None] * 8
+        for name, columns in layout.columns.items():
+            for column in columns:
+                owner[column] = name
+        return owner
+    if key in (("achieved_goal",), ("desired_goal",)):
+        owner = [None] * 3
+        for name, columns in layout.goal.items():
+            for column in columns:
+                owner[column] = name
+        return owner
+    return None
+
+
+@dataclass
+class Case:
+    layout: EntityLayout
+    rb: ReplayBuffer
+    transform: CAIACTransform
+    donors: ReplayBuffer | None
+    window: int
+    ratio: float
+    swap_prob: float
+
+
+def time_order(rb: ReplayBuffer) -> list[int]:
+    """The storage's rows from the oldest to the newest."""
+    length, cursor = len(rb), rb.storage._last_cursor_index
+    if length < rb.storage.max_size or cursor is None:
+        return list(range(length))
+    return [(cursor + 1 + i) % length for i in range(length)]
+
+
+def donor_windows(
+    rb: ReplayBuffer, layout: EntityLayout, window: int, entity: int
+) -> set[tuple[int, ...]]:
+    """The row names of all windows that may donate an entity, one by one."""
+    order, data, found = time_order(rb), rb.storage[:], set()
+    for start in range(len(order) - window + 1):
+        part = order[start : start + window]
+        same = len({int(data["episode"][i]) for i in part}) == 1
+        # `<=` in float32, as the scores are stored
+        free = all(bool(data["caiac", "score"][i, entity] <= THRESHOLD) for i in part)
+        if same and free and layout.names[entity] not in layout.fixed:
+            found.add(tuple(int(data["row"][i]) for i in part))
+    return found
+
+
+def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
+    """Raises where the batch is anything that section 3's invariants forbid.
+
+    Returns how often each entity lacked a donor.
+    """
+    layout, window = case.layout, case.window
+    total = batch.shape[0] // window
+    first = total - round(case.ratio * total)
+    names = [
+        tuple(batch["row"][b * window : (b + 1) * window].tolist())
+        for b in range(total)
+    ]
+    raw = case.rb.storage[:]
+    place = {int(row): i for i, row in enumerate(raw["row"])}
+    stored = raw[torch.tensor([place[row] for part in names for row in part])]
+    score = stored["caiac", "score"]
+    swapped, marked = batch["caiac", "swapped"], batch["caiac", "counterfactual"]
+    assert swapped.shape == (total * window, N) and swapped.dtype == torch.bool
+    assert marked.shape == (total * window, 1) and marked.dtype == torch.bool
+    free = [
+        [
+            layout.names[n] not in layout.fixed
+            and all(bool(score[b * window + k, n] <= THRESHOLD) for k in range(window))
+            for n in range(N)
+        ]
+        for b in range(total)
+    ]
+    allowed = (
+        []
+        if case.donors is None
+        else [donor_windows(case.donors, layout, window, n) for n in range(N)]
+    )
+    keys = [
+        key if isinstance(key, tuple) else (key,) for key in stored.keys(True, True)
+    ]
+    assert {("caiac", "swapped"), ("caiac", "counterfactual")} == {
+        key if isinstance(key, tuple) else (key,) for key in batch.keys(True, True)
+    } - set(keys)
+    sources: dict[tuple[int, int], set[tuple[int, ...]]] = {}
+    for key in keys:
+        value, real = batch[key], stored[key]
+        assert value.dtype == real.dtype and value.shape == real.shape
+        owner = owner_of(layout, key)
+        if owner is None:
+            assert torch.equal(value, real), key
+            continue
+        value, real = value.reshape(len(value), -1), real.reshape(len(real), -1)
+        for column in range(value.shape[1]):
+            name = owner if isinstance(owner, str) else owner[column]
+            for b in range(total):
+                part = slice(b * window, (b + 1) * window)
+                n = None if name is None else layout.names.index(name)
+                if b < first or n is None or not bool(swapped[b * window, n]):
+                    assert torch.equal(value[part, column], real[part, column]), key
+                    continue
+                coded = value[part, column].double()
+                coded = coded if key[0] != "next" else -coded - 1
+                origin = tuple((coded // STRIDE).long().tolist())
+                own = real[part, column].double()
+                own = own if key[0] != "next" else -own - 1
+                # the same column as before, of another row
+                assert torch.equal(coded % STRIDE, own % STRIDE)
+                sources.setdefault((b, n), set()).add(origin)
+    for b in range(total):
+        rows = slice(b * window, (b + 1) * window)
+        assert bool(marked[rows].all()) == bool(marked[rows].any()) == (b >= first)
+        for n in range(N):
+            here = swapped[rows, n]
+            assert bool(here.all()) == bool(here.any())
+            if b < first or not free[b][n]:
+                assert not here.any()
+                continue
+            if case.donors is None:
+                options = {names[c] for c in range(total) if c != b and free[c][n]}
+            else:
+                options = allowed[n]
+            if not options:
+                missing[n] += case.swap_prob == 1.0
+                assert not here.any()
+            elif case.swap_prob == 1.0:
+                assert here.all()
+            if here.any():
+                assert len(sources[b, n]) == 1
+                assert next(iter(sources[b, n])) in options
+    return missing
+
+
+lengths = st.lists(st.integers(1, 9), min_size=1, max_size=4)
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    window = draw(st.integers(1, 5))
+    layout = draw(st.sampled_from([FLAT, FLAT_FREE, NESTED]))
+    dtype = draw(
+        st.sampled_from([torch.float32, torch.float64, torch.float16, torch.int64])
+    )
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+    goals = layout is not FLAT_FREE
+
+    def buffer(offset: int, **kwargs) -> ReplayBuffer:
+        parts = [*draw(lengths), draw(st.integers(window, window + 4))]
+        rows = offset + torch.arange(sum(parts))
+        data = make_data(layout, rows, parts, generator, dtype, goals)
+        # a storage smaller than the data is a ring that was written past its end
+        least = max(window, sum(parts) // 2)
+        size = draw(st.integers(least, sum(parts) + 2))
+        storage = draw(st.sampled_from([LazyTensorStorage, LazyMemmapStorage]))
+        rb = ReplayBuffer(storage=storage(size), **kwargs)
+        for begin in range(0, len(data), least):
+            rb.extend(data[begin : begin + least])
+        return rb
+
+    batch = draw(st.integers(1, 8))
+    rb = buffer(
+        0,
+        batch_size=batch * window,
+        sampler=None
+        if window == 1
+        else SliceSampler(slice_len=window, traj_key="episode"),
+    )
+    donors = buffer(STRIDE, batch_size=1) if draw(st.booleans()) else None
+    ratio = draw(st.sampled_from([0.0, 0.3, 0.5, 0.9, 1.0]))
+    swap_prob = draw(st.sampled_from([0.0, 0.5, 1.0]))
+    transform = CAIACTransform(
+        layout,
+        threshold=THRESHOLD,
+        counterfactual_ratio=ratio,
+        swap_prob=swap_prob,
+        window=window,
+        donors=donors,
+        generator=generator,
+    )
+    return Case(layout, rb, transform, donors, window, ratio, swap_prob)
+
+
+def has_long_enough(rb: ReplayBuffer, window: int) -> bool:
+    order, data = time_order(rb), rb.storage[:]
+    return any(
+        len({int(data["episode"][i]) for i in order[s : s + window]}) == 1
+        for s in range(len(order) - window + 1)
+    )
+
+
+@settings(
+    max_examples=80,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@given(case=cases())
+def test_invariants(case: Case) -> None:
+    if not has_long_enough(case.rb, case.window):
+        return
+    before = case.rb.storage[:].clone()
+    others = None if case.donors is None else case.donors.storage[:].clone()
+    case.rb.append_transform(case.transform)
+    missing = [0] * N
+    for _ in range(2):
+        missing = check_batch(case, case.rb.sample(), missing)
+    if case.swap_prob == 1.0:
+        assert case.transform.no_donor_count.tolist() == missing
+    assert (case.rb.storage[:] == before).all()
+    if others is not None:
+        assert (case.donors.storage[:] == others).all()
+
+
+# --- small fixed data ----------------------------------------------------------------
+
+
+def small(
+    layout: EntityLayout = FLAT,
+    storage: type[TensorStorage] = LazyTensorStorage,
+    window: int = 1,
+    batch: int = 8,
+    size: int = 20,
+    free: bool = True,
+    **kwargs,
+) -> ReplayBuffer:
+    generator = torch.Generator().manual_seed(0)
+    data = make_data(
+        layout,
+        torch.arange(20),
+        [10, 10],
+        generator,
+        goals=layout is not FLAT_FREE,
+    )
+    if free:
+        data["caiac", "score"].zero_()
+    sampler = (
+        None if window == 1 else SliceSampler(slice_len=window, traj_key="episode")
+    )
+    rb = ReplayBuffer(
+        storage=storage(size), sampler=sampler, batch_size=batch * window, **kwargs
+    )
+    rb.extend(data)
+    return rb
+
+
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+def test_reading_a_full_storage_changes_nothing_in_it(layout, storage) -> None:
+    rb = small(layout, storage)
+    before = rb.storage[:].clone()
+    rb.append_transform(CAIACTransform(layout))
+    out = rb[:]
+    assert out["caiac", "swapped"].any()
+    assert (rb.storage[:] == before).all()
+    assert ("caiac", "swapped") not in rb.storage[:].keys(True, True)
+
+
+@pytest.mark.parametrize("donor", [False, True])
+def test_same_generator_state_gives_the_same_batch(donor: bool) -> None:
+    donors = small() if donor else None
+    batches = []
+    for _ in range(2):
+        generator = torch.Generator().manual_seed(3)
+        rb = small()
+        rb.set_rng(torch.Generator().manual_seed(5))
+        transform = CAIACTransform(FLAT, swap_prob=0.5, donors=donors)
+        transform.set_generator(generator)
+        rb.append_transform(transform)
+        batches.append([rb.sample() for _ in range(3)])
+    for one, other in zip(*batches, strict=True):
+        assert (one == other).all()
+
+
+def test_global_generator_without_one() -> None:
+    rb = small()
+    td = rb.sample()
+    transform = CAIACTransform(FLAT, swap_prob=0.5)
+    torch.manual_seed(0)
+    one = transform(td)
+    torch.manual_seed(0)
+    assert (transform(td) == one).all()
+
+
+def test_draw_and_apply_are_apart() -> None:
+    td = small(batch=6).sample()
+    transform = CAIACTransform(FLAT, counterfactual_ratio=1.0)
+    draw = transform.generate_parameters(td["caiac", "score"])
+    assert draw.donors.shape == draw.swapped.shape == (6, N)
+    one = transform.apply_parameters(td, draw)
+    assert (transform.apply_parameters(td, draw) == one).all()
+
+
+def test_donors_of_one_row_are_independent() -> None:
+    rb = small(FLAT_FREE, batch=20)
+    transform = CAIACTransform(
+        FLAT_FREE,
+        counterfactual_ratio=1.0,
+        generator=torch.Generator().manual_seed(0),
+    )
+    scores = torch.zeros(20, N)
+    draws = torch.stack(
+        [transform.generate_parameters(scores).donors for _ in range(2000)]
+    ).float()
+    # uniform over the 19 other rows, for each row and entity, and uncorrelated
+    for row in (0, 7, 19):
+        counts = torch.bincount(draws[:, row, 1].long(), minlength=20)
+        assert counts[row] == 0
+        expected = 2000 / 19
+        chi2 = ((counts.float() - expected) ** 2 / expected).sum() - expected
+        assert chi2 < 43.8  # 18 degrees of freedom, p = 0.0006
+    flat = draws.reshape(-1, N)
+    assert torch.corrcoef(flat.T)[0, 1].abs() < 0.03
+    assert rb is not None
+
+
+def test_swap_prob_is_a_probability() -> None:
+    transform = CAIACTransform(
+        FLAT,
+        counterfactual_ratio=1.0,
+        swap_prob=0.3,
+        generator=torch.Generator().manual_seed(1),
+    )
+    swapped = transform.generate_parameters(torch.zeros(20_000, N)).swapped
+    share = swapped.float().mean(0)
+    assert share[0] == 0.0  # fixed
+    assert (share[1:] - 0.3).abs().max() < 0.015
+
+
+@pytest.mark.parametrize("window", [1, 3])
+@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.5, 1.0])
+def test_share_of_counterfactuals(window: int, ratio: float) -> None:
+    rb = small(window=window, batch=7)
+    rb.append_transform(CAIACTransform(FLAT, counterfactual_ratio=ratio, window=window))
+    marked = rb.sample()["caiac", "counterfactual"].view(7, window)
+    count = round(ratio * 7)
+    assert marked.sum() == count * window
+    assert marked[7 - count :].all()
+
+
+def test_rewards_of_counterfactual_rows_come_from_next_achieved_goals() -> None:
+    seen = {}
+
+    def reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+        seen["achieved"], seen["desired"] = achieved, desired
+        return (achieved - desired).abs().sum(-1)
+
+    for layout in (FLAT, NESTED):
+        rb = small(layout, batch=6)
+        raw = rb.sample()
+        out = CAIACTransform(layout, reward_fn=reward)(raw)
+        achieved, desired = ("achieved_goal", "desired_goal")
+        if layout is NESTED:
+            achieved, desired = ("got", "cup"), ("goal", "cup")
+        path = (achieved,) if isinstance(achieved, str) else achieved
+        assert torch.equal(seen["achieved"], out[("next", *path)][3:])
+        assert torch.equal(seen["desired"], out[desired][3:])
+        wanted = (out[("next", *path)] - out[desired]).abs().sum(-1, keepdim=True)
+        assert torch.equal(out["next", "reward"][3:], wanted[3:])
+        assert torch.equal(out["next", "reward"][:3], raw["next", "reward"][:3])
+        assert (out["next", "reward"][3:] != raw["next", "reward"][3:]).any()
+
+
+def test_rewards_from_observation_columns() -> None:
+    td = small(batch=4).sample()
+    td = td.exclude("achieved_goal", ("next", "achieved_goal"))
+    out = CAIACTransform(
+        FLAT, counterfactual_ratio=1.0, reward_fn=lambda a, d: (a + d).sum(-1)
+    )(td)
+    columns = [2, 7, 1]  # mirrored by the goal's columns 0, 1, 2
+    wanted = out["next", "observation"][:, columns] + out["desired_goal"]
+    assert torch.equal(out["next", "reward"][:, 0], wanted.sum(-1))
+
+
+def test_reward_errors() -> None:
+    td = small(batch=4).sample()
+    with pytest.raises(ValueError, match=r"reward_fn returned \[\].*wanted \[2\]"):
+        CAIACTransform(FLAT, reward_fn=lambda a, d: (a - d).sum())(td)
+    with pytest.raises(KeyError, match="no desired goals"):
+        CAIACTransform(FLAT, reward_fn=lambda a, d: a)(
+            td.exclude("desired_goal", ("next", "desired_goal"))
+        )
+    with pytest.raises(KeyError, match="reward_key"):
+        CAIACTransform(FLAT, reward_fn=lambda a, d: a, reward_key="r")(td)
+    with pytest.raises(TypeError, match="reward_fn is a function"):
+        CAIACTransform(FLAT, reward_fn=1.0)
+
+
+def test_renamed_keys() -> None:
+    td = small(batch=4).sample()
+    td = td.rename_key_(("caiac", "score"), ("a", "b", "s"))
+    out = CAIACTransform(
+        FLAT,
+        score_key=("a", "b", "s"),
+        counterfactual_key="cf",
+        swapped_key=("x", "y"),
+    )(td)
+    assert out["cf"].sum() == 2
+    assert out["x", "y"].shape == (4, N)
+
+
+def test_works_under_prefetch_and_in_a_tensordict_buffer() -> None:
+    source = small()
+    rb = TensorDictReplayBuffer(storage=LazyTensorStorage(20), batch_size=6, prefetch=2)
+    rb.append_transform(CAIACTransform(FLAT))
+    rb.extend(source.storage[:])
+    for _ in range(5):
+        batch = rb.sample()
+        assert batch["caiac", "swapped"][3:, 1:].all()
+        assert not batch["caiac", "swapped"][:3].any()
+
+
+# --- donor buffers -------------------------------------------------------------------
+
+
+def test_index_of_donors_is_rebuilt_only_after_writes() -> None:
+    donors = small()
+    transform = CAIACTransform(FLAT, donors=donors, counterfactual_ratio=1.0)
+    td = small(batch=4).sample()
+    transform(td)
+    built = transform._donors[0].index()[0]
+    transform(td)
+    assert transform._donors[0].index()[0] is built
+    data = donors.storage[:].clone()
+    data["caiac", "score"] = torch.full((20, N), 1.0)
+    donors.extend(data)
+    assert not transform(td)["caiac", "swapped"].any()
+    assert transform.no_donor_count.tolist() == [0, 4, 4]
+    transform.reset_no_donor_count()
+    assert transform.no_donor_count.tolist() == [0, 0, 0]
+    donors.storage[:]["caiac", "score"].zero_()  # behind the storage's back
+    transform.refresh_donors()
+    assert transform(td)["caiac", "swapped"].any()
+
+
+def test_unscored_donors_are_not_eligible() -> None:
+    donors = small()
+    score = donors.storage[:]["caiac", "score"]
+    score[1:, 1] = math.nan
+    transform = CAIACTransform(FLAT, donors=donors, counterfactual_ratio=1.0)
+    draw = transform.generate_parameters(torch.zeros(50, N))
+    assert (draw.donors[:, 1] == 0).all()
+    assert draw.swapped[:, 1].all()
+
+
+def test_alone_in_the_batch_there_is_no_donor() -> None:
+    rb = small(batch=1)
+    transform = CAIACTransform(FLAT, counterfactual_ratio=1.0)
+    raw = rb.sample()
+    out = transform(raw)
+    assert torch.equal(out["observation"], raw["observation"])
+    assert not out["caiac", "swapped"].any()
+    assert out["caiac", "counterfactual"].all()
+    assert transform.no_donor_count.tolist() == [0, 1, 1]
+
+
+def test_donor_storage_that_is_not_contiguous() -> None:
+    data = small().storage[:].clone()
+    wide = torch.cat([data["observation"], data["observation"]], -1)
+    data["observation"] = wide[:, :8]  # a view
+    rb = small(batch=6)
+    transform = CAIACTransform(
+        FLAT, donors=TensorStorage(data), counterfactual_ratio=1.0
+    )
+    out = transform(rb.sample())
+    assert torch.equal(out["observation"][:, 7] % STRIDE, torch.full((6,), 7.0))
+
+
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+@pytest.mark.parametrize("window", [1, 3])
+def test_goals_of_donor_windows(layout: EntityLayout, window: int) -> None:
+    donors = small(layout)
+    # a donor buffer needs no stored desired goals when they are drawn
+    data = donors.storage[:].exclude("desired_goal", "goal")
+    data = data.exclude(("next", "desired_goal"), ("next", "goal"))
+    donors = ReplayBuffer(storage=LazyTensorStorage(20))
+    donors.extend(data)
+    goals = WindowGoal(layout, window, mixture={"last": 1.0})
+    rb = small(layout, window=window, batch=6)
+    transform = CAIACTransform(
+        layout, donors=donors, goals=goals, window=window, counterfactual_ratio=1.0
+    )
+    batch = rb.sample()
+    draw = transform.generate_parameters(batch["caiac", "score"])
+    out = transform.apply_parameters(batch, draw)
+    assert draw.goal_rows is not None
+    # the donor trajectory's last row, whose next state is the goal
+    last = torch.where(draw.donors < 10, 9, 19)
+    assert torch.equal(draw.goal_rows[:, 1:], last[:, 1:])
+    if layout is FLAT:
+        # goal column 2, 0 of the cup mirror observation columns 1, 2
+        for column, mirrored, entity in ((2, 1, 1), (0, 2, 1), (1, 7, 2)):
+            wanted = -(last[:, entity] * STRIDE + mirrored) - 1.0
+            wanted = wanted.repeat_interleave(window)
+            assert torch.equal(out["desired_goal"][:, column], wanted)
+            assert torch.equal(out["next", "desired_goal"][:, column], wanted)
+    else:
+        wanted = leaf(last[:, 1], 2, first=10, sign=-1).float()
+        wanted = wanted.repeat_interleave(window, 0)
+        assert torch.equal(out["goal", "cup"], wanted)
+
+
+def test_goals_need_a_donor_buffer_and_the_same_window() -> None:
+    goals = WindowGoal(FLAT, 2)
+    with pytest.raises(ValueError, match="there is none"):
+        CAIACTransform(FLAT, window=2, goals=goals)
+    with pytest.raises(ValueError, match="goals has window 2"):
+        CAIACTransform(FLAT, donors=small(), goals=goals)
+    with pytest.raises(TypeError, match="goals is a WindowGoal"):
+        CAIACTransform(FLAT, donors=small(), goals="last")
+
+
+def test_donor_buffer_errors() -> None:
+    td = small(batch=4).sample()
+
+    def transform(data: TensorDict, **kwargs) -> CAIACTransform:
+        donors = ReplayBuffer(storage=LazyTensorStorage(20))
+        donors.extend(data)
+        return CAIACTransform(FLAT, donors=donors, **kwargs)
+
+    good = small().storage[:]
+    with pytest.raises(ValueError, match="donor buffer is empty"):
+        CAIACTransform(FLAT, donors=ReplayBuffer(storage=LazyTensorStorage(3)))(td)
+    with pytest.raises(TypeError, match="donors is a ReplayBuffer"):
+        CAIACTransform(FLAT, donors=good)
+    with pytest.raises(KeyError, match="donor buffer has no scores"):
+        transform(good.exclude("caiac"))(td)
+    bad = good.clone()
+    bad["caiac", "score"] = torch.zeros(20, 2)
+    with pytest.raises(ValueError, match=r"shape \[20, 2\], wanted \[20, 3\]"):
+        transform(bad)(td)
+    bad = good.clone()
+    bad["caiac", "score"][4, 1] = -math.inf
+    with pytest.raises(ValueError, match="infinite in row 4"):
+        transform(bad)(td)
+    bad = good.clone()
+    bad["observation"] = torch.zeros(20, 9)
+    with pytest.raises(ValueError, match=r"'observation' has rows of \[9\].*\[8\]"):
+        transform(bad)(td)
+    bad = good.clone()
+    bad["observation"] = bad["observation"].double()
+    with pytest.raises(ValueError, match=r"float64.*float32"):
+        transform(bad)(td)
+    with pytest.raises(KeyError, match=r"no 'desired_goal'.*WindowGoal"):
+        transform(good.exclude("desired_goal"))(td)
+    with pytest.raises(KeyError, match="no 'achieved_goal'"):
+        transform(good.exclude("achieved_goal"))(td)
+    windows = small(window=2, batch=2).sample()
+    with pytest.raises(KeyError, match=r"neither trajectory ids in 'episode'"):
+        transform(good.exclude("episode", ("next", "done")), window=2)(windows)
+    bad = good.clone()
+    bad["observation"][:, 5] = math.nan
+    with pytest.raises(ValueError, match="'observation' is not finite"):
+        transform(bad)(td)
+    two = ReplayBuffer(storage=LazyTensorStorage(20, ndim=2))
+    two.extend(good.view(2, 10))
+    with pytest.raises(TypeError, match="one-dimensional"):
+        CAIACTransform(FLAT, donors=two)(td)
+
+
+# --- bad input -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("threshold", -0.1, ValueError),
+        ("threshold", math.nan, ValueError),
+        ("threshold", math.inf, ValueError),
+        ("threshold", "0.1", TypeError),
+        ("counterfactual_ratio", 1.5, ValueError),
+        ("counterfactual_ratio", -0.5, ValueError),
+        ("counterfactual_ratio", True, TypeError),
+        ("swap_prob", 1.01, ValueError),
+        ("swap_prob", math.nan, ValueError),
+        ("swap_prob", None, TypeError),
+        ("window", 0, ValueError),
+        ("window", 2.0, TypeError),
+        ("window", True, TypeError),
+        ("generator", 0, TypeError),
+    ],
+)
+def test_arguments_out_of_range(name: str, value: object, error: type) -> None:
+    with pytest.raises(error, match=name):
+        CAIACTransform(FLAT, **{name: value})
+    with pytest.raises(TypeError, match="layout is an EntityLayout"):
+        CAIACTransform({"arm": [0]})
+
+
+def test_score_errors() -> None:
+    transform = CAIACTransform(FLAT)
+    td = small(batch=4).sample()
+    with pytest.raises(KeyError, match=r"no scores in \('caiac', 'score'\).*score_buf"):
+        transform(td.exclude("caiac"))
+    bad = td.copy()
+    bad["caiac", "score"] = torch.zeros(4, 2)
+    with pytest.raises(ValueError, match=r"shape \[4, 2\], wanted \[4, 3\].*'arm'"):
+        transform(bad)
+    bad["caiac", "score"] = torch.zeros(4, N)
+    bad["caiac", "score"][1, 2] = math.nan
+    with pytest.raises(ValueError, match=r"not scored, in 1 of 4 rows for \['box'\]"):
+        transform(bad)
+    bad["caiac", "score"][1, 2] = math.inf
+    with pytest.raises(ValueError, match=r"infinite for \['box'\]"):
+        transform(bad)
+    # without checks such a row is neither swapped nor a donor
+    bad["caiac", "score"][1, 2] = math.nan
+    out = CAIACTransform(FLAT, counterfactual_ratio=1.0, check=False)(bad)
+    assert out["caiac", "swapped"][:, 2].tolist() == [True, False, True, True]
+
+
+def test_layout_that_does_not_fit() -> None:
+    td = small(batch=4).sample()
+    with pytest.raises(ValueError, match=r"8 columns.*at least 9"):
+        CAIACTransform(EntityLayout({"a": [8], "b": [0], "c": [1]}))(td)
+    with pytest.raises(KeyError, match="the layout reads"):
+        CAIACTransform(
+            EntityLayout({"a": [0], "b": [1], "c": [2]}, observation_key="state")
+        )(td)
+    with pytest.raises(KeyError, match="next"):
+        CAIACTransform(FLAT)(td.exclude(("next", "observation")))
+    with pytest.raises(KeyError, match="arm"):
+        CAIACTransform(NESTED)(td)
+    with pytest.raises(ValueError, match="'achieved_goal', which must follow"):
+        CAIACTransform(FLAT_FREE)(td)
+    bad = td.copy()
+    bad["desired_goal"] = torch.zeros(4, 2)
+    with pytest.raises(ValueError, match=r"'desired_goal' has shape \[4, 2\].* 3 col"):
+        CAIACTransform(FLAT)(bad)
+    with pytest.raises(ValueError, match=r"goal lacks \['cup'\]"):
+        EntityLayout({"arm": [0], "cup": [1]}, goal={"arm": [0]})
+    with pytest.raises(TypeError, match="made of tensors"):
+        bad = small(NESTED, batch=4).sample()
+        bad.set_non_tensor(("state", "cup", "name"), "mug")
+        CAIACTransform(NESTED)(bad)
+
+
+def test_windows_that_do_not_fit() -> None:
+    rb = small(window=2, batch=4)
+    td = rb.sample()
+    with pytest.raises(ValueError, match="8 rows, which windows of 3 do not divide"):
+        CAIACTransform(FLAT, window=3)(td)
+    with pytest.raises(ValueError, match="window 0 of 4 rows crosses"):
+        CAIACTransform(FLAT, window=4)(rb.storage[8:16])
+    # without ids, end flags tell
+    with pytest.raises(ValueError, match="window 0 of 4 rows crosses"):
+        CAIACTransform(FLAT, window=4)(rb.storage[8:16].exclude("episode"))
+    out = CAIACTransform(FLAT, window=4)(rb.storage[2:10].exclude("episode"))
+    assert out["caiac", "swapped"][4:, 1:].all()
+    with pytest.raises(ValueError, match=r"shape \[2, 4\], wanted \[B"):
+        CAIACTransform(FLAT)(td.view(2, 4))
+    with pytest.raises(ValueError, match=r"shape \[0\]"):
+        CAIACTransform(FLAT)(td[:0])
+
+
+def test_trajectories_shorter_than_the_window_and_empty_buffers() -> None:
+    rb = small(window=11, batch=2)
+    rb.append_transform(CAIACTransform(FLAT, window=11))
+    with pytest.raises(RuntimeError, match="sufficient length"):
+        rb.sample()
+    rb = ReplayBuffer(storage=LazyTensorStorage(3), batch_size=2)
+    rb.append_transform(CAIACTransform(FLAT))
+    with pytest.raises(RuntimeError, match="empty"):
+        rb.sample()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_observations_that_are_not_finite(value: float) -> None:
+    for layout, key in (
+        (FLAT, "observation"),
+        (FLAT, ("next", "observation")),
+        (NESTED, ("state", "cup", "pos")),
+        (NESTED, ("next", "state", "cup", "pos")),
+    ):
+        td = small(layout, batch=4).sample().clone()
+        td[key][0, 2] = value
+        with pytest.raises(
+            ValueError, match=r"is not finite.* 1 values, first in row 0"
+        ):
+            CAIACTransform(layout, counterfactual_ratio=0.0)(td)
+        CAIACTransform(layout, check=False)(td)
+
+
+def test_large_finite_values_pass() -> None:
+    td = small(batch=4).sample().clone()
+    td["observation"] = torch.full((4, 8), 3e38)
+    assert CAIACTransform(FLAT)(td)["observation"].isfinite().all()
+
+
+# --- writing, copying ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
+def test_rows_extended_without_scores_count_as_unscored(storage) -> None:
+    rb = small(storage=storage, size=30, batch=4)
+    rb.append_transform(CAIACTransform(FLAT))
+    more = small().storage[:5].exclude("caiac")
+    rb.extend(more)
+    rb.add(more[0])
+    score = rb.storage[:]["caiac", "score"]
+    assert score[20:].isnan().all() and not score[:20].isnan().any()
+    assert ("caiac", "score") not in more.keys(True, True)
+    rb.extend(small().storage[:4])  # scores that come with the data stay
+    assert not rb.storage[:]["caiac", "score"][-4:].isnan().any()
+    with pytest.raises(ValueError, match="not scored"):
+        for _ in range(50):
+            rb.sample()
+
+
+def test_pickle_and_clone() -> None:
+    donors = small()
+    transform = CAIACTransform(FLAT, donors=donors, counterfactual_ratio=1.0)
+    td = small(batch=4).sample()
+    transform(td)
+    for copy in (pickle.loads(pickle.dumps(transform)), transform.clone()):
+        torch.manual_seed(0)
+        one = transform(td)
+        torch.manual_seed(0)
+        assert (copy(td) == one).all()
+    assert "threshold=0.05" in repr(transform) and "donors=ReplayBuffer" in repr(
+        transform
+    )
+    assert CAIACTransform(FLAT).donors is None
+    assert transform.share_memory_().no_donor_count.sum() == 0
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+def test_on_the_gpu(layout: EntityLayout) -> None:
+    td = small(layout, batch=8).sample().to("cuda")
+    transform = CAIACTransform(layout, check=False)
+    transform(td)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        out = transform(td)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert out["caiac", "swapped"][4:, 1:].all()

@@ -1,0 +1,351 @@
+"""WindowGoal: draws, reading, and the way through a replay buffer."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ListStorage,
+    ReplayBuffer,
+    SliceSampler,
+)
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.transforms import CAIACTransform, WindowGoal
+from torchrl_caiac.transforms.window_goal import draw_goal_offset
+
+LAYOUT = EntityLayout(
+    {"arm": [0], "cup": [1, 2]},
+    goal={"cup": [1, 0]},
+    achieved={"cup": [1, 2]},
+    fixed=["arm"],
+)
+NESTED = EntityLayout.from_keys(
+    {"arm": ("s", "arm"), "cup": ("s", "cup")},
+    goal={"cup": ("g", "cup")},
+    achieved={"cup": ("s", "cup")},
+    fixed=["arm"],
+)
+
+
+def make(lengths: list[int], nested: bool = False) -> TensorDict:
+    total = sum(lengths)
+    rows = torch.arange(total)
+    done = torch.zeros(total, 1, dtype=torch.bool)
+    done[torch.tensor(lengths).cumsum(0) - 1] = True
+    state = rows.view(-1, 1) * 10.0 + torch.arange(3)
+    td = TensorDict(
+        {
+            "row": rows,
+            "episode": torch.repeat_interleave(
+                torch.arange(len(lengths)), torch.tensor(lengths)
+            ),
+            "next": {"done": done},
+            ("caiac", "score"): torch.zeros(total, 2),
+        },
+        [total],
+    )
+    if nested:
+        for where, value in (((), state), (("next",), state + 10)):
+            td[(*where, "s", "arm")] = value[:, :1]
+            td[(*where, "s", "cup", "x")] = value[:, 1]
+            td[(*where, "s", "cup", "y")] = value[:, 2:]
+    else:
+        td["observation"] = state
+        td["next", "observation"] = state + 10
+    return td
+
+
+def buffer(
+    goals: WindowGoal,
+    lengths: list[int],
+    size: int | None = None,
+    batch: int = 6,
+    storage=LazyTensorStorage,
+    nested: bool = False,
+    traj: bool = True,
+    **kwargs,
+) -> ReplayBuffer:
+    data = make(lengths, nested)
+    sampler = None
+    if goals.window > 1:
+        key = {"traj_key": "episode"} if traj else {"end_key": ("next", "done")}
+        sampler = SliceSampler(slice_len=goals.window, **key)
+    if not traj:
+        data = data.exclude("episode")
+    size = size or len(data)
+    rb = ReplayBuffer(
+        storage=storage(size),
+        sampler=sampler,
+        sample_unit=goals,
+        batch_size=batch * goals.window,
+        **kwargs,
+    )
+    rb.append_transform(goals)
+    for begin in range(0, len(data), 3):
+        rb.extend(data[begin : begin + 3])
+    return rb
+
+
+# --- draws ---------------------------------------------------------------------------
+
+
+@given(
+    remaining=st.lists(st.integers(0, 50), min_size=1, max_size=20),
+    weights=st.tuples(*[st.floats(0, 3)] * 3).filter(lambda w: sum(w) > 0.01),
+    p=st.floats(0.01, 1.0),
+    seed=st.integers(0, 2**31),
+)
+@settings(deadline=None)
+def test_offsets_stay_in_the_trajectory(remaining, weights, p, seed) -> None:
+    mixture = dict(zip(("last", "uniform", "geometric"), weights, strict=True))
+    left = torch.tensor(remaining)
+    drawn = [
+        draw_goal_offset(
+            left, mixture, p=p, generator=torch.Generator().manual_seed(seed)
+        )
+        for _ in range(2)
+    ]
+    assert torch.equal(*drawn)
+    assert ((drawn[0] >= 0) & (drawn[0] <= left)).all()
+    if mixture["uniform"] == mixture["geometric"] == 0:
+        assert torch.equal(drawn[0], left)
+
+
+def shares(mixture: dict[str, float], left: int, p: float = 0.3) -> torch.Tensor:
+    drawn = draw_goal_offset(
+        torch.full((200_000,), left),
+        mixture,
+        p=p,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return torch.bincount(drawn, minlength=left + 1) / 200_000
+
+
+def test_distributions() -> None:
+    left, p = 6, 0.3
+    uniform = torch.full((7,), 1 / 7)
+    geometric = torch.tensor([p * (1 - p) ** k for k in range(7)])
+    geometric[-1] += 1 - geometric.sum()  # clipped to the last state
+    last = torch.zeros(7)
+    last[-1] = 1.0
+    assert (shares({"uniform": 2.0}, left) - uniform).abs().max() < 0.004
+    assert (shares({"geometric": 0.1}, left, p) - geometric).abs().max() < 0.004
+    mixed = 0.5 * last + 0.3 * geometric + 0.2 * uniform
+    drawn = shares({"last": 5, "geometric": 3, "uniform": 2}, left, p)
+    assert (drawn - mixed).abs().max() < 0.004
+    assert shares({"geometric": 1.0}, left, 1.0)[0] == 1.0
+
+
+# --- through a buffer ----------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 9), min_size=1, max_size=4),
+    window=st.integers(1, 4),
+    seed=st.integers(0, 2**31),
+    nested=st.booleans(),
+    memmap=st.booleans(),
+    ring=st.booleans(),
+    traj=st.booleans(),
+)
+def test_goals_are_later_states_of_the_same_trajectory(
+    lengths, window, seed, nested, memmap, ring, traj
+) -> None:
+    lengths = [*lengths, window + 2]
+    total = sum(lengths)
+    size = max(window + 2, (2 * total) // 3) if ring else total + 3
+    layout = NESTED if nested else LAYOUT
+    goals = WindowGoal(
+        layout,
+        window,
+        mixture={"last": 1, "uniform": 1, "geometric": 1},
+        generator=torch.Generator().manual_seed(seed),
+    )
+    rb = buffer(
+        goals,
+        lengths,
+        size,
+        storage=LazyMemmapStorage if memmap else LazyTensorStorage,
+        nested=nested,
+        traj=traj,
+    )
+    rb.set_rng(torch.Generator().manual_seed(seed))
+    raw = rb.storage[:].clone()
+    batch = rb.sample()
+    # rows are written in the order of their names, so a name tells what is behind
+    end = torch.tensor(lengths).cumsum(0) - 1
+    if nested:
+        goal = torch.stack([batch["g", "cup", "x"], batch["g", "cup", "y"][:, 0]], -1)
+    else:
+        goal = batch["desired_goal"].flip(-1)  # goal columns 1, 0 mirror 1, 2
+    goal = goal.view(-1, window, 2)
+    assert (goal == goal[:, :1]).all()
+    for names, (first, second) in zip(
+        batch["row"].view(-1, window).tolist(), goal[:, 0].tolist(), strict=True
+    ):
+        reached = (int(first) - 1) // 10 - 1  # the row whose next state it is
+        assert (first, second) == (reached * 10 + 11, reached * 10 + 12)
+        last = min(int(e) for e in end if e >= names[-1])
+        assert names[-1] <= reached <= last
+    assert (rb.storage[:] == raw).all()
+
+
+def test_last_respects_writes_and_the_cursor() -> None:
+    goals = WindowGoal(LAYOUT, 2, mixture={"last": 1.0})
+    rb = buffer(goals, [6], size=8, batch=4)
+    assert (rb.sample()["desired_goal"][:, 1] == 61).all()
+    more = make([9])[6:9]  # the same trajectory goes on; row 0 is overwritten
+    rb.extend(more)
+    assert len(rb) == 8
+    assert (rb.sample()["desired_goal"][:, 1] == 91).all()
+
+
+def test_transitions_and_next_desired_goals() -> None:
+    goals = WindowGoal(LAYOUT, 1, mixture={"last": 1.0})
+    rb = ReplayBuffer(storage=LazyTensorStorage(10), sample_unit=goals, batch_size=5)
+    rb.append_transform(goals)
+    data = make([10])
+    data["desired_goal"] = torch.zeros(10, 2)
+    data["next", "desired_goal"] = torch.zeros(10, 2)
+    rb.extend(data)
+    batch = rb.sample()
+    for key in ("desired_goal", ("next", "desired_goal")):
+        assert (batch[key] == torch.tensor([102.0, 101.0])).all()
+        assert (rb.storage[:][key] == 0).all()
+
+
+def test_goals_from_stored_achieved_goals() -> None:
+    layout = EntityLayout({"arm": [0], "cup": [1, 2]}, goal={"arm": (), "cup": [0]})
+    goals = WindowGoal(layout, 1, mixture={"last": 1.0})
+    rb = ReplayBuffer(storage=LazyTensorStorage(10), sample_unit=goals, batch_size=5)
+    rb.append_transform(goals)
+    data = make([10])
+    data["next", "achieved_goal"] = torch.arange(10.0).unsqueeze(-1)
+    rb.extend(data)
+    assert (rb.sample()["desired_goal"] == 9.0).all()
+
+
+def test_goals_follow_the_swap() -> None:
+    goals = WindowGoal(LAYOUT, 2, mixture={"last": 1.0})
+    rb = buffer(goals, [5, 5, 5, 5], batch=20)
+    rb.append_transform(
+        CAIACTransform(LAYOUT, window=2, counterfactual_ratio=1.0, threshold=0.1)
+    )
+    batch = rb.sample()
+    # the cup's trajectory, read from its own column, names the goal
+    trajectory = (batch["observation"][:, 1] // 50).long()
+    assert (trajectory != batch["episode"]).any()
+    assert torch.equal(batch["desired_goal"][:, 1], (trajectory + 1) * 50.0 + 1)
+
+
+def test_prefetch_and_reproducibility() -> None:
+    batches = []
+    for _ in range(2):
+        goals = WindowGoal(LAYOUT, 2)
+        goals.set_generator(torch.Generator().manual_seed(0))
+        rb = buffer(goals, [8, 8], batch=4, prefetch=1)
+        rb.set_rng(torch.Generator().manual_seed(1))
+        batches.append([rb.sample() for _ in range(4)])
+    for one, other in zip(*batches, strict=True):
+        assert (one == other).all()
+
+
+def test_pickle_and_clone() -> None:
+    goals = WindowGoal(LAYOUT, 2, mixture={"last": 1.0})
+    for copy in (pickle.loads(pickle.dumps(goals)), goals.clone()):
+        assert (buffer(copy, [6]).sample()["desired_goal"][:, 1] == 61).all()
+        assert "window=2" in repr(copy)
+
+
+# --- bad input -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"window": 0}, "window is a number of rows"),
+        ({"window": True}, "window is a number of rows"),
+        ({"mixture": {}}, "mixture maps strategies"),
+        ({"mixture": {"first": 1.0}}, "mixture maps strategies"),
+        ({"mixture": {"last": -1.0}}, "weights of mixture"),
+        ({"mixture": {"last": 0.0}}, "weights of mixture"),
+        ({"mixture": {"last": math.nan}}, "weights of mixture"),
+        ({"p": 0.0}, r"lies in \(0, 1\]"),
+        ({"p": 1.1}, r"lies in \(0, 1\]"),
+        ({"layout": EntityLayout({"cup": [0]})}, "no goals"),
+        (
+            {"layout": EntityLayout.from_keys({"cup": "c"}, goal={"cup": "g"})},
+            r"achieved goals of \['cup'\]",
+        ),
+    ],
+)
+def test_arguments(arguments: dict, match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        WindowGoal(**{"layout": LAYOUT, "window": 2, **arguments})
+
+
+def test_without_a_draw_or_after_the_augmentation() -> None:
+    goals = WindowGoal(LAYOUT, 2)
+    rb = buffer(goals, [6])
+    with pytest.raises(RuntimeError, match="sample_unit="):
+        rb[:]
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(6),
+        sampler=SliceSampler(slice_len=2, traj_key="episode"),
+        sample_unit=goals,
+        batch_size=4,
+    )
+    rb.append_transform(CAIACTransform(LAYOUT, window=2))
+    rb.append_transform(goals)
+    rb.extend(make([6]))
+    with pytest.raises(RuntimeError, match="append WindowGoal before"):
+        rb.sample()
+    goals.expand(torch.tensor([0, 1]), {}, rb.storage)
+    with pytest.raises(RuntimeError, match="drawn for 1 windows"):
+        goals(rb.storage[:])
+
+
+def test_windows_that_do_not_fit() -> None:
+    goals = WindowGoal(LAYOUT, 3)
+    storage = buffer(goals, [5, 5]).storage
+    with pytest.raises(ValueError, match="4 rows, which windows of 3"):
+        goals.expand(torch.arange(4), {}, storage)
+    for rows in ([3, 4, 5], [0, 2, 4], [2, 1, 0]):
+        with pytest.raises(ValueError, match="not consecutive rows of one traj"):
+            goals.expand(torch.tensor(rows), {}, storage)
+    with pytest.raises(RuntimeError, match="sufficient length"):
+        buffer(WindowGoal(LAYOUT, 6), [5, 5]).sample()
+
+
+def test_data_that_do_not_fit() -> None:
+    goals = WindowGoal(LAYOUT, 1)
+
+    def draw(data: TensorDict, goals: WindowGoal = goals) -> None:
+        rb = ReplayBuffer(storage=LazyTensorStorage(10))
+        rb.extend(data)
+        goals.expand(torch.tensor([0]), {}, rb.storage)
+
+    data = make([5])
+    with pytest.raises(KeyError, match="neither trajectory ids"):
+        draw(data.exclude("episode", ("next", "done")))
+    with pytest.raises(KeyError, match="goals are read from"):
+        draw(data.exclude(("next", "observation")))
+    with pytest.raises(KeyError, match="goals of 'cup' are read"):
+        draw(data, WindowGoal(NESTED, 1))
+    data["next", "observation"] = torch.zeros(5, 2)
+    with pytest.raises(ValueError, match=r"2 columns.*at least 3"):
+        draw(data)
+    with pytest.raises(ValueError, match="buffer is empty"):
+        goals.expand(torch.tensor([0]), {}, LazyTensorStorage(3))
+    with pytest.raises(TypeError, match="one-dimensional TensorStorage"):
+        goals.expand(torch.tensor([0]), {}, ListStorage(3))
