@@ -118,7 +118,10 @@ def nested_data(
     def tree(state: torch.Tensor) -> dict[str, object]:
         return {
             "arm": state[:, :3].clone(),
-            "kettle": {"position": state[:, 3:6].clone(), "tilt": state[:, 6:9].clone()},
+            "kettle": {
+                "position": state[:, 3:6].clone(),
+                "tilt": state[:, 6:9].clone(),
+            },
         }
 
     data = TensorDict(

@@ -164,12 +164,12 @@ class TestFlat:
 
 class TestCheck:
     def test_missing_key_names_what_there_is(self):
-        with pytest.raises(KeyError, match="'observation'.*lacks.*state"):
+        with pytest.raises(KeyError, match=r"'observation'.*lacks.*state"):
             fetch().check(TensorDict({"state": torch.zeros(2, 34)}, [2]))
 
     def test_narrow_observation(self):
         td = TensorDict({"observation": torch.zeros(2, 33)}, [2])
-        with pytest.raises(ValueError, match="33 columns.*at least 34"):
+        with pytest.raises(ValueError, match=r"33 columns.*at least 34"):
             fetch().check(td)
 
     def test_next(self):
@@ -187,7 +187,7 @@ class TestCheck:
             },
             [2],
         ).set(key, torch.zeros(2, 5))
-        with pytest.raises(ValueError, match="has 5 columns.*goal has 6"):
+        with pytest.raises(ValueError, match=r"has 5 columns.*goal has 6"):
             fetch().check(td, next=True)
 
     def test_scalar_observation(self):

@@ -115,11 +115,15 @@ def test_public_names_have_a_docstring(room: str, name: str) -> None:
         return  # a constant: described where it is defined
     doc = inspect.getdoc(thing) or ""
     assert len(doc) > 20, f"{room}.{name} has no docstring"
-    own = [n for n, v in vars(thing).items() if inspect.isfunction(v)] if (
-        inspect.isclass(thing)
-    ) else []
+    own = (
+        [n for n, v in vars(thing).items() if inspect.isfunction(v)]
+        if (inspect.isclass(thing))
+        else []
+    )
     bare = [
-        n for n in own if not n.startswith("_") and not inspect.getdoc(getattr(thing, n))
+        n
+        for n in own
+        if not n.startswith("_") and not inspect.getdoc(getattr(thing, n))
     ]
     assert not bare, f"{room}.{name} has public methods without docstring: {bare}"
 

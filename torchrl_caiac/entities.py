@@ -155,7 +155,10 @@ class EntityLayout:
         Examples:
             >>> from torchrl_caiac import EntityLayout
             >>> EntityLayout.from_keys(
-            ...     {"arm": ("observation", "arm"), "kettle": ("observation", "kettle")},
+            ...     {
+            ...         "arm": ("observation", "arm"),
+            ...         "kettle": ("observation", "kettle"),
+            ...     },
             ...     fixed=("arm",),
             ... )
             EntityLayout(
@@ -262,7 +265,7 @@ class EntityLayout:
 
     @property
     def is_flat(self) -> bool:
-        """Whether entities are columns of one observation (else leaves of their own)."""
+        """Whether entities are columns of one observation, not leaves of their own."""
         return not self.keys
 
     @property

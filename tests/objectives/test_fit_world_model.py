@@ -25,7 +25,7 @@ def world(rows: int = 2000, *, seed: int = 0, dtype: Any = torch.float32) -> Ten
     generator = torch.Generator().manual_seed(seed)
     observation = torch.rand(rows, 4, generator=generator, dtype=dtype) * 2 - 1
     action = torch.rand(rows, 2, generator=generator, dtype=dtype) * 2 - 1
-    touches = (observation[:, :1] - observation[:, 2:3]).abs() < 0.3
+    touches = (observation[:, :1] - observation[:, 2:3]).abs() < 0.5
     change = 0.1 * torch.cat([action, action * touches], 1)
     noise = 1e-3 * torch.randn(rows, 4, generator=generator, dtype=dtype)
     return TensorDict(
@@ -62,11 +62,11 @@ def test_learns_the_dynamics_and_where_the_cup_moves() -> None:
     history = fit(model, data, steps=800, eval_every=200, batch_size=256, lr=3e-3)
     assert history["step"].tolist() == [200, 400, 600, 800]
     mse = history["validation_mse"][-1]
-    assert mse["arm"] < 2e-5 and mse["cup"] < 5e-4  # of 0.0033 and about 0.001
+    assert mse["arm"] < 2e-5 and mse["cup"] < 6e-4  # of 0.0033 and 0.0015
     assert history["validation_nll"][-1] < history["validation_nll"][0]
     fresh = world(500, seed=1)
     own = EntityDynamicsLoss(model).entity_mse(fresh)
-    assert own["arm"] < 2e-5 and own["cup"] < 5e-4
+    assert own["arm"] < 2e-5 and own["cup"] < 6e-4
     assert not model.training
 
 
@@ -358,8 +358,8 @@ def test_wrong_data_are_named(tmp_path: Path) -> None:
     refused(ValueError, "have no row", [])
     refused(ValueError, r"batch size \[10, 10\]", data.reshape(10, 10))
     refused(ValueError, "single trajectory", data[:20])
-    refused(KeyError, "trajectory key 'episode'", data.exclude("episode"))
-    refused(KeyError, "lack the action 'action'", data.exclude("action"))
+    refused(KeyError, "the trajectory key .+episode", data.exclude("episode"))
+    refused(KeyError, "lack the action .+action", data.exclude("action"))
     refused(KeyError, "observation", data.exclude("observation"))
     refused(KeyError, "next", data.exclude("next"))
     other = data.clone()

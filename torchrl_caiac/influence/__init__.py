@@ -1,3 +1,27 @@
 """Which entities an action can influence: estimators, and their cached scores."""
 
 from __future__ import annotations
+
+from torchrl_caiac.influence.cai import CAI, causal_action_influence
+from torchrl_caiac.influence.score_buffer import MarkUnscored, score_buffer
+from torchrl_caiac.influence.truth import (
+    TrueInfluence,
+    best_threshold,
+    influence_report,
+    oracle_score,
+    roc_auc,
+    true_influence,
+)
+
+__all__ = [
+    "CAI",
+    "MarkUnscored",
+    "TrueInfluence",
+    "best_threshold",
+    "causal_action_influence",
+    "influence_report",
+    "oracle_score",
+    "roc_auc",
+    "score_buffer",
+    "true_influence",
+]

@@ -374,6 +374,8 @@ class GaussianWorldModel(TensorDictModuleBase):
             if isinstance(part, torch.Tensor):
                 yield from part.to(device).split(_STATISTICS_ROWS)
                 continue
+            if not part.numel():
+                continue
             rows = part if part.batch_dims == 1 else part.reshape(-1)
             for start in range(0, len(rows), _STATISTICS_ROWS):
                 td = rows[start : start + _STATISTICS_ROWS].to(device)

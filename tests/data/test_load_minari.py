@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import gymnasium
+import minari
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
+from torchrl.data import SliceSampler
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.data import load_minari, load_transitions, offline_buffer
+from torchrl_caiac.influence import score_buffer
+
+LENGTHS = (4, 1, 6)
+
+
+def box(*shape: int) -> spaces.Box:
+    return spaces.Box(-np.inf, np.inf, shape, np.float64)
+
+
+def arrays(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return rng.normal(size=shape)
+
+
+def flat(rng: np.random.Generator, length: int) -> np.ndarray:
+    return arrays(rng, length + 1, 3)
+
+
+def goal_env(rng: np.random.Generator, length: int) -> dict:
+    return {
+        "observation": arrays(rng, length + 1, 5),
+        "achieved_goal": {"kettle": arrays(rng, length + 1, 2)},
+        "desired_goal": {"kettle": arrays(rng, length + 1, 2)},
+    }
+
+
+def parts(rng: np.random.Generator, length: int) -> dict:
+    return {"arm": arrays(rng, length + 1, 2), "cup": arrays(rng, length + 1, 1)}
+
+
+SPACES = {
+    flat: box(3),
+    goal_env: spaces.Dict(
+        {
+            "observation": box(5),
+            "achieved_goal": spaces.Dict({"kettle": box(2)}),
+            "desired_goal": spaces.Dict({"kettle": box(2)}),
+        }
+    ),
+    parts: spaces.Dict({"arm": box(2), "cup": box(1)}),
+}
+
+
+@pytest.fixture(autouse=True)
+def _root(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+
+
+def make_dataset(observe, lengths=LENGTHS, spoil=None, name="caiac/test-v0"):
+    rng = np.random.default_rng(0)
+    buffers = []
+    for number, length in enumerate(lengths):
+        ends = np.zeros(length, bool)
+        ends[-1] = number == 0
+        buffer = EpisodeBuffer(
+            observations=observe(rng, length),
+            actions=rng.uniform(-1, 1, (length, 2)),
+            rewards=arrays(rng, length),
+            terminations=ends,
+            truncations=np.zeros(length, bool),
+            infos={"clock": np.arange(length + 1.0)},
+        )
+        if spoil is not None:
+            spoil(number, buffer)
+        buffers.append(buffer)
+    return minari.create_dataset_from_buffers(
+        name,
+        buffer=buffers,
+        observation_space=SPACES[observe],
+        action_space=spaces.Box(-1, 1, (2,), np.float64),
+    ), buffers
+
+
+def test_flat_rows_agree_with_a_loop(tmp_path):
+    dataset, buffers = make_dataset(flat)
+    rows = load_minari(dataset, tmp_path / "rows", infos=["clock"], progress=False)
+    assert rows.is_memmap()
+    assert rows.batch_size == (sum(LENGTHS),)
+    row = 0
+    for number, (buffer, length) in enumerate(zip(buffers, LENGTHS, strict=True)):
+        for step in range(length):
+            td = rows[row]
+            for key, value in (
+                ("observation", buffer.observations[step]),
+                (("next", "observation"), buffer.observations[step + 1]),
+                ("action", buffer.actions[step]),
+                (("next", "reward"), buffer.rewards[step : step + 1]),
+            ):
+                torch.testing.assert_close(td[key], torch.tensor(value).float())
+            last = step == length - 1
+            assert td["episode"] == number
+            assert td["next", "done"].item() is last
+            assert td["next", "terminated"].item() is (last and number == 0)
+            assert td["next", "truncated"].item() is (last and number != 0)
+            assert td["info", "clock"] == step
+            row += 1
+    assert rows["next", "done"].shape == (sum(LENGTHS), 1)
+
+
+def test_by_id_and_opened_again(tmp_path):
+    make_dataset(flat)
+    rows = load_minari("caiac/test-v0", tmp_path / "rows", progress=False)
+    assert (load_transitions(tmp_path / "rows") == rows).all()
+
+
+def test_goal_environment(tmp_path):
+    dataset, buffers = make_dataset(goal_env)
+    rows = load_minari(dataset, tmp_path / "rows", columns=[4, 0], progress=False)
+    assert rows["observation"].shape == (11, 2)
+    expected = buffers[0].observations["observation"]
+    torch.testing.assert_close(
+        rows["next", "observation"][3], torch.tensor(expected[4, [4, 0]]).float()
+    )
+    assert rows["achieved_goal", "kettle"].dtype == torch.float32
+    assert rows["next", "achieved_goal", "kettle"].shape == (11, 2)
+
+
+def test_entities_as_dict(tmp_path):
+    dataset, _ = make_dataset(parts)
+    rows = load_minari(dataset, tmp_path / "rows", progress=False)
+    layout = EntityLayout.from_keys(
+        {"arm": ("observation", "arm"), "cup": ("observation", "cup")}
+    )
+    assert layout.read(rows, next=True).shape == (11, 3)
+
+
+def test_windows_and_scores(tmp_path):
+    dataset, _ = make_dataset(flat, lengths=(8, 8))
+    rows = load_minari(dataset, tmp_path / "rows", progress=False)
+    sampler = SliceSampler(slice_len=4, traj_key="episode", cache_values=True)
+    rb = offline_buffer(rows, batch_size=8, sampler=sampler)
+
+    class Height:
+        layout = EntityLayout({"arm": [0, 1], "cup": [2]})
+
+        def __call__(self, td):
+            return td["observation"][:, 1:]
+
+    score_buffer(rb, Height(), lookahead=0, progress=False)
+    batch = rb.sample()
+    torch.testing.assert_close(batch["caiac", "score"], batch["observation"][:, 1:])
+    windows = batch["episode"].view(-1, 4)
+    assert (windows == windows[:, :1]).all()
+    opened = load_transitions(tmp_path / "rows")
+    torch.testing.assert_close(opened["caiac", "score"], rows["observation"][:, 1:])
+
+
+def nan_observation(number, buffer):
+    if number == 1:
+        buffer.observations[1, 0] = np.nan
+
+
+def inf_action(number, buffer):
+    if number == 2:
+        buffer.actions[0, 0] = np.inf
+
+
+def missing_state(number, buffer):
+    if number == 2:
+        object.__setattr__(buffer, "observations", buffer.observations[:-1])  # frozen
+
+
+@pytest.mark.parametrize(
+    ("spoil", "match"),
+    [
+        (nan_observation, "'observation' in episode 1 .*NaN"),
+        (inf_action, "'action' in episode 2 .*infinite"),
+        (missing_state, "'observation' in episode 2 .*has 6 entries, wanted 7"),
+    ],
+)
+def test_bad_episodes_leave_nothing(spoil, match, tmp_path):
+    dataset, _ = make_dataset(flat, spoil=spoil)
+    with pytest.raises(ValueError, match=match):
+        load_minari(dataset, tmp_path / "rows", progress=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["minari"]
+
+
+def test_arguments(tmp_path):
+    dataset, _ = make_dataset(flat)
+    with pytest.raises(KeyError, match=r"no 'force' in its infos.*clock"):
+        load_minari(dataset, tmp_path / "rows", infos=["force"], progress=False)
+    with pytest.raises(ValueError, match=r"columns reach from 0 to 3.*3 columns"):
+        load_minari(dataset, tmp_path / "rows", columns=[0, 3], progress=False)
+    load_minari(dataset, tmp_path / "rows", progress=False)
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        load_minari(dataset, tmp_path / "rows", progress=False)
+    again = load_minari(dataset, tmp_path / "rows", overwrite=True, progress=False)
+    assert len(again) == sum(LENGTHS)
+    with pytest.raises(FileNotFoundError, match="absent-v0"):
+        load_minari("caiac/absent-v0", tmp_path / "other", progress=False)
+    assert isinstance(dataset.observation_space, gymnasium.spaces.Box)

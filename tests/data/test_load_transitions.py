@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_caiac.data.load_transitions import load_transitions
+
+
+def rows(n=6):
+    return TensorDict(
+        {
+            "observation": torch.randn(n, 3),
+            "action": torch.randn(n, 2),
+            "episode": torch.arange(n) // 3,
+            "next": {"observation": torch.randn(n, 3), "done": torch.ones(n, 1) > 0},
+            "odd/key": torch.randn(n),
+        },
+        [n],
+    )
+
+
+def test_what_was_written_is_read(tmp_path):
+    data = rows()
+    data.memmap(tmp_path / "data")
+    loaded = load_transitions(tmp_path / "data")
+    assert (loaded == data).all()
+    assert loaded.is_memmap()
+    # A leaf can be added, and is there the next time.
+    loaded.make_memmap(("caiac", "score"), shape=[6, 2]).fill_(3.0)
+    again = load_transitions(tmp_path / "data")
+    assert (again["caiac", "score"] == 3).all()
+
+
+@pytest.mark.parametrize("name", ["observation", "next/observation", "odd%2Fkey"])
+@pytest.mark.parametrize("size", [0, 7, 4000])
+def test_a_truncated_file_is_noticed_and_left_as_it_is(name, size, tmp_path):
+    rows().memmap(tmp_path / "data")
+    file = tmp_path / "data" / f"{name}.memmap"
+    file.write_bytes((file.read_bytes() * 100)[:size])
+    with pytest.raises(ValueError, match=f"has {size} bytes, wanted") as error:
+        load_transitions(tmp_path / "data")
+    assert "make the data again" in str(error.value)
+    assert file.stat().st_size == size
+
+
+@pytest.mark.parametrize("name", ["meta.json", "next/meta.json", "action.memmap"])
+def test_a_missing_file(name, tmp_path):
+    rows().memmap(tmp_path / "data")
+    (tmp_path / "data" / name).unlink()
+    with pytest.raises(ValueError, match="is missing"):
+        load_transitions(tmp_path / "data")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}', '{"shape": "x"}'])
+def test_a_foreign_meta_file(text, tmp_path):
+    rows().memmap(tmp_path / "data")
+    (tmp_path / "data/meta.json").write_text(text)
+    with pytest.raises(ValueError, match="truncated or foreign"):
+        load_transitions(tmp_path / "data")
+
+
+def test_another_batch_size(tmp_path):
+    rows().reshape(2, 3).memmap(tmp_path / "data")
+    with pytest.raises(ValueError, match=r"batch size \[2, 3\], wanted \[T\]"):
+        load_transitions(tmp_path / "data")
+
+
+def test_missing_folders_and_keys(tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no folder"):
+        load_transitions(tmp_path / "absent")
+    with pytest.raises(ValueError, match="no memory-mapped tensordict"):
+        load_transitions(tmp_path)
+    rows().exclude("episode").memmap(tmp_path / "data")
+    with pytest.raises(ValueError, match=r"lacks \['episode'\]"):
+        load_transitions(tmp_path / "data")
+    assert len(load_transitions(tmp_path / "data", keys=["action"])) == 6
+
+
+def test_an_unknown_dtype_is_not_guessed(tmp_path):
+    rows().memmap(tmp_path / "data")
+    meta = tmp_path / "data/meta.json"
+    content = json.loads(meta.read_text())
+    content["action"]["shape"] = [6, 3]
+    meta.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="wanted 72"):
+        load_transitions(tmp_path / "data")

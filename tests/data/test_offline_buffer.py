@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import SliceSampler
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.data.load_transitions import load_transitions
+from torchrl_caiac.data.offline_buffer import offline_buffer
+from torchrl_caiac.influence.score_buffer import score_buffer
+
+
+def rows(n=12):
+    x = torch.randn(n + 1, 2)
+    done = torch.zeros(n, 1, dtype=torch.bool)
+    done[3::4] = True
+    return TensorDict(
+        {
+            "observation": x[:-1],
+            "action": torch.randn(n, 2),
+            "episode": torch.arange(n) // 4,
+            "next": {"observation": x[1:], "done": done},
+        },
+        [n],
+    )
+
+
+class Read:
+    layout = EntityLayout({"arm": [0], "cup": [1]})
+
+    def __call__(self, td):
+        return td["observation"].abs()
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_windows_with_scores(mapped, tmp_path):
+    data = rows()
+    if mapped:
+        data.memmap(tmp_path / "data")
+        data = load_transitions(tmp_path / "data")
+    sampler = SliceSampler(slice_len=3, traj_key="episode", cache_values=True)
+    rb = offline_buffer(data, 6, sampler)
+    rb.sample()
+    score_buffer(rb, Read(), lookahead=0, progress=False)
+    assert data.is_memmap() == mapped
+    for _ in range(5):
+        batch = rb.sample()
+        assert torch.equal(batch["caiac", "score"], batch["observation"].abs())
+        windows = batch["episode"].reshape(2, 3)
+        assert (windows == windows[:, :1]).all()
+    if mapped:
+        again = load_transitions(tmp_path / "data")
+        assert torch.equal(again["caiac", "score"], again["observation"].abs())
+
+
+def test_it_cannot_be_extended():
+    rb = offline_buffer(rows(), 6)
+    with pytest.raises(RuntimeError, match="immutable"):
+        rb.extend(rows())
+
+
+def test_bad_data():
+    with pytest.raises(TypeError, match="got Tensor"):
+        offline_buffer(torch.zeros(3))
+    with pytest.raises(ValueError, match=r"batch size \[0\]"):
+        offline_buffer(rows()[:0])
+    with pytest.raises(ValueError, match=r"batch size \[3, 4\]"):
+        offline_buffer(rows().reshape(3, 4))

@@ -1,0 +1,124 @@
+"""Opens a folder of transitions, and notices when it is not whole."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict._utils_key_json import _encode_key_for_filesystem
+from tensordict.utils import NestedKey
+
+__all__ = ["load_transitions"]
+
+_KEYS: tuple[NestedKey, ...] = ("action", "episode", ("next", "done"))
+
+
+def load_transitions(
+    path: str | Path, *, keys: Iterable[NestedKey] = _KEYS
+) -> TensorDict:
+    """Opens a memory-mapped tensordict of flat transitions.
+
+    ``TensorDict.load_memmap`` fills what a truncated file lacks with zeros, in the data
+    and on disk. This checks the size of every file first, and returns a tensordict that
+    knows that it is memory-mapped, so that leaves can be added to it.
+
+    Args:
+        path (str or Path): the folder, of :func:`load_minari` or of any
+            ``tensordict.memmap(path)`` with one batch dimension.
+
+    Keyword Args:
+        keys (iterable of NestedKey): what the data must have. Defaults to ``"action"``,
+            ``"episode"`` and ``("next", "done")``.
+
+    Returns:
+        TensorDict: the rows, ``[T]``, memory-mapped and locked. Writing into a leaf
+        writes to disk.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+        ValueError: the folder is no memory-mapped tensordict, is truncated, has no rows
+            or several batch dimensions, or lacks a key.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.load_transitions import load_transitions
+        >>> rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = rows.memmap(folder)
+        ...     load_transitions(folder, keys=["action"]).batch_size
+        torch.Size([3])
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise FileNotFoundError(
+            f"there is no folder {path}: make the data first, for instance with "
+            "load_minari"
+        )
+    shape = _check_folder(path, path)
+    if len(shape) != 1 or not shape[0]:
+        raise ValueError(
+            f"{path} has the batch size {shape}, wanted [T] with at least one row: "
+            "store flat transitions"
+        )
+    data = TensorDict.load_memmap(path)
+    missing = [key for key in keys if data.get(key, None) is None]
+    if missing:
+        found = sorted(map(str, data.keys(include_nested=True, leaves_only=True)))
+        raise ValueError(
+            f"{path} lacks {missing}, it has {found}: it holds something else, or was "
+            "made with other keys"
+        )
+    # Loaded, a tensordict has mapped leaves but does not know it; nothing is copied.
+    return data.memmap_(path)
+
+
+def _check_folder(folder: Path, root: Path) -> list[int]:
+    """Checks that every leaf has its file at full length; returns the batch size."""
+    meta = folder / "meta.json"
+    again = "delete the folder and make the data again"
+    if not meta.exists():
+        raise ValueError(
+            f"{root} is no memory-mapped tensordict, {meta} is missing: give another "
+            f"folder, or {again}"
+        )
+    try:
+        content = json.loads(meta.read_text(encoding="utf-8"))
+        shape = [int(size) for size in content["shape"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{meta} is truncated or foreign ({error}): {again}"
+        ) from error
+    for key, entry in content.items():
+        if not isinstance(entry, dict):
+            continue
+        name = _encode_key_for_filesystem(key)
+        if entry.get("type") is not None:
+            if entry["type"] == "TensorDict":
+                _check_folder(folder / name, root)
+            continue
+        file = folder / f"{name}.memmap"
+        if not file.exists():
+            raise ValueError(f"{root} is not whole, {file} is missing: {again}")
+        wanted = _bytes(entry)
+        if wanted is not None and file.stat().st_size != wanted:
+            raise ValueError(
+                f"{file} has {file.stat().st_size} bytes, wanted {wanted} "
+                f"({entry['dtype']} {entry['shape']}): it is truncated or foreign, "
+                f"{again}"
+            )
+    return shape
+
+
+def _bytes(entry: dict[str, Any]) -> int | None:
+    dtype = getattr(torch, str(entry.get("dtype")).removeprefix("torch."), None)
+    shape = entry.get("shape")
+    if not isinstance(dtype, torch.dtype) or not isinstance(shape, list):
+        return None
+    return dtype.itemsize * math.prod(shape)

@@ -1,0 +1,396 @@
+"""Inverse kinematics of a point on a MuJoCo robot, by damped least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["IKSolution", "InverseKinematics", "rotation_vector"]
+
+_SMALL_ANGLE = 1e-7
+
+
+class IKSolution(NamedTuple):
+    """A joint configuration and how far it leaves the tool from its target.
+
+    Attributes:
+        joints: joint positions `[J]` in radians (metres for sliding joints).
+        position_error: distance of the tool point to its target, in metres.
+        rotation_error: angle between tool and target orientation, in radians
+            (0 where no orientation was asked for).
+    """
+
+    joints: NDArray[np.float64]
+    position_error: float
+    rotation_error: float
+
+
+def rotation_vector(rotation: ArrayLike) -> NDArray[np.float64]:
+    """Return axis times angle of a rotation matrix.
+
+    Args:
+        rotation: rotation matrix `[3, 3]`.
+
+    Returns:
+        vector `[3]` whose direction is the axis and whose length is the angle, in
+        radians, between 0 and pi.
+
+    Example:
+        >>> import numpy as np
+        >>> turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> rotation_vector(turn).round(4).tolist()
+        [0.0, 0.0, 1.5708]
+    """
+    matrix = np.asarray(rotation, dtype=np.float64)
+    if matrix.shape != (3, 3):
+        raise ValueError(f"rotation has shape {matrix.shape}, wanted (3, 3)")
+    # The quaternion's largest component first: stable at every angle, pi included.
+    diagonal = np.diag(matrix)
+    squares = np.concatenate([[diagonal.sum()], 2 * diagonal - diagonal.sum()]) + 1
+    largest = int(squares.argmax())
+    skew = np.array(
+        [
+            matrix[2, 1] - matrix[1, 2],
+            matrix[0, 2] - matrix[2, 0],
+            matrix[1, 0] - matrix[0, 1],
+        ]
+    )
+    quaternion = np.empty(4)
+    if largest == 0:
+        quaternion[0] = squares[0]
+        quaternion[1:] = skew
+    else:
+        axis = largest - 1
+        quaternion[0] = skew[axis]
+        quaternion[1:] = matrix[axis] + matrix[:, axis]
+        quaternion[largest] = squares[largest]
+    quaternion /= np.linalg.norm(quaternion)
+    if quaternion[0] < 0:
+        quaternion = -quaternion
+    sine = float(np.linalg.norm(quaternion[1:]))
+    if sine < _SMALL_ANGLE:
+        return 2 * quaternion[1:]
+    return quaternion[1:] * (2 * np.arctan2(sine, quaternion[0]) / sine)
+
+
+class InverseKinematics:
+    """Finds joint positions that bring a tool point to a pose.
+
+    Each iteration solves the damped least-squares problem
+    `min |W (J dq - e)|^2 + damping^2 |dq|^2`, where `e` holds the position error and
+    the orientation error. Joints that the step would push over a limit are frozen
+    there and the rest is solved again. What freedom is left pulls the joints towards
+    `posture`.
+
+    The solver works on its own copy of the simulation data and never changes the
+    robot that it plans for.
+
+    Args:
+        model: the `mujoco.MjModel`.
+        site: name of the site that carries the tool.
+        joints: names of the joints that may move, each with one degree of freedom.
+
+    Keyword Args:
+        offset: the tool point in the site's frame, `[3]`, metres.
+        limits: lower and upper joint limits `[J, 2]`; the model's own where None.
+        damping: damping of the least-squares step.
+        rotation_weight: weight of one radian of orientation error against one metre.
+        iterations: iterations of one solve.
+        posture_gain: share of the way to `posture` that an iteration takes in the
+            null space.
+        max_step: largest change of a joint in one iteration, radians.
+
+    Raises:
+        ValueError: unknown site or joint, joints with several degrees of freedom,
+            limits of the wrong shape.
+
+    Example:
+        >>> import mujoco, numpy as np
+        >>> model = mujoco.MjModel.from_xml_string('''
+        ... <mujoco><worldbody><body><joint name="a" axis="0 0 1"/>
+        ...   <geom size=".1"/><body pos="1 0 0"><joint name="b" axis="0 0 1"/>
+        ...   <geom size=".1"/><site name="tip" pos="1 0 0"/>
+        ... </body></body></worldbody></mujoco>''')
+        >>> solver = InverseKinematics(model, "tip", ["a", "b"], iterations=50)
+        >>> start = np.array([0.1, 0.1])
+        >>> solution = solver.solve(start, position=[1.0, 1.0, 0.0])
+        >>> solution.position_error < 1e-3
+        True
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        site: str,
+        joints: Sequence[str],
+        *,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+        limits: ArrayLike | None = None,
+        damping: float = 0.03,
+        rotation_weight: float = 0.3,
+        iterations: int = 8,
+        posture_gain: float = 0.1,
+        max_step: float = 0.3,
+    ) -> None:
+        import mujoco
+
+        self._mujoco = mujoco
+        self.model = model
+        self.data = mujoco.MjData(model)
+        self.site = self._index(mujoco.mjtObj.mjOBJ_SITE, "site", site)
+        self.body = int(model.site_bodyid[self.site])
+        ids = [self._index(mujoco.mjtObj.mjOBJ_JOINT, "joint", name) for name in joints]
+        single = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+        for name, joint in zip(joints, ids, strict=True):
+            if int(model.jnt_type[joint]) not in single:
+                raise ValueError(
+                    f"joint {name!r} has several degrees of freedom; give sliding or "
+                    "hinge joints only"
+                )
+        self.qpos_index = np.array([int(model.jnt_qposadr[j]) for j in ids])
+        self.dof_index = np.array([int(model.jnt_dofadr[j]) for j in ids])
+        self.offset = np.asarray(offset, dtype=np.float64)
+        if limits is None:
+            ranges = model.jnt_range[ids].copy()
+            free = ~model.jnt_limited[ids].astype(bool)
+            ranges[free] = (-np.inf, np.inf)
+            self.limits = ranges
+        else:
+            self.limits = np.array(limits, dtype=np.float64)
+        if self.limits.shape != (len(ids), 2):
+            raise ValueError(
+                f"limits have shape {self.limits.shape}, wanted {(len(ids), 2)}: one "
+                "(lower, upper) row per joint"
+            )
+        # Bodies that the joints carry: children follow their parents in the model.
+        self._moved = np.zeros(model.nbody, dtype=bool)
+        self._moved[model.jnt_bodyid[ids]] = True
+        for body in range(1, model.nbody):
+            self._moved[body] |= self._moved[model.body_parentid[body]]
+        self.damping = damping
+        self.rotation_weight = rotation_weight
+        self.iterations = iterations
+        self.posture_gain = posture_gain
+        self.max_step = max_step
+        self._jacobian_position = np.zeros((3, model.nv))
+        self._jacobian_rotation = np.zeros((3, model.nv))
+
+    def _index(self, kind: Any, label: str, name: str) -> int:
+        index = int(self._mujoco.mj_name2id(self.model, kind, name))
+        if index < 0:
+            raise ValueError(f"the model has no {label} named {name!r}")
+        return index
+
+    def pose(self, qpos: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where the tool is in a configuration.
+
+        Args:
+            qpos: positions of the whole model, `[nq]`.
+
+        Returns:
+            the tool point `[3]` in metres and the site's rotation matrix `[3, 3]`.
+        """
+        self.data.qpos[:] = qpos
+        self._mujoco.mj_kinematics(self.model, self.data)
+        rotation = self.data.site_xmat[self.site].reshape(3, 3).copy()
+        point = self.data.site_xpos[self.site] + rotation @ self.offset
+        return point, rotation
+
+    def solve(
+        self,
+        qpos: ArrayLike,
+        position: ArrayLike,
+        rotation: ArrayLike | None = None,
+        *,
+        posture: ArrayLike | None = None,
+        iterations: int | None = None,
+    ) -> IKSolution:
+        """Move the joints so that the tool comes to a pose.
+
+        Args:
+            qpos: positions of the whole model `[nq]` to start from; everything but
+                the solver's joints stays as it is.
+            position: target of the tool point, `[3]`, metres, world frame.
+            rotation: target rotation matrix `[3, 3]` of the site; free where None.
+
+        Keyword Args:
+            posture: joint positions `[J]` that the null space is pulled towards.
+            iterations: iterations of this call; the solver's own where None.
+
+        Returns:
+            the joints and what error is left.
+
+        Raises:
+            ValueError: non-finite target.
+        """
+        target = np.asarray(position, dtype=np.float64)
+        if target.shape != (3,) or not np.isfinite(target).all():
+            raise ValueError(
+                f"position is {target.tolist()}, wanted three finite numbers"
+            )
+        orientation = None if rotation is None else np.asarray(rotation, np.float64)
+        pull = None if posture is None else np.asarray(posture, dtype=np.float64)
+        configuration = np.array(qpos, dtype=np.float64)
+        joints = np.clip(configuration[self.qpos_index], *self.limits.T)
+        for _ in range(self.iterations if iterations is None else iterations):
+            configuration[self.qpos_index] = joints
+            error, jacobian = self._linearise(configuration, target, orientation)
+            joints = joints + self._step(joints, error, jacobian, pull)
+        configuration[self.qpos_index] = joints
+        point, reached = self.pose(configuration)
+        angle = (
+            0.0
+            if orientation is None
+            else float(np.linalg.norm(rotation_vector(orientation @ reached.T)))
+        )
+        return IKSolution(joints, float(np.linalg.norm(target - point)), angle)
+
+    def _linearise(
+        self,
+        configuration: NDArray[np.float64],
+        target: NDArray[np.float64],
+        orientation: NDArray[np.float64] | None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the weighted error `[3 or 6]` and its Jacobian `[3 or 6, J]`."""
+        point, rotation = self.pose(configuration)
+        self._mujoco.mj_comPos(self.model, self.data)
+        self._mujoco.mj_jac(
+            self.model,
+            self.data,
+            self._jacobian_position,
+            self._jacobian_rotation,
+            point,
+            self.body,
+        )
+        error = target - point
+        jacobian = self._jacobian_position[:, self.dof_index]
+        if orientation is None:
+            return error, jacobian
+        weight = self.rotation_weight
+        turn = rotation_vector(orientation @ rotation.T)
+        return (
+            np.concatenate([error, weight * turn]),
+            np.concatenate(
+                [jacobian, weight * self._jacobian_rotation[:, self.dof_index]]
+            ),
+        )
+
+    def _step(
+        self,
+        joints: NDArray[np.float64],
+        error: NDArray[np.float64],
+        jacobian: NDArray[np.float64],
+        posture: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64]:
+        """Return the change of the joints `[J]`, limits respected."""
+        low, high = self.limits.T
+        free = np.ones(joints.size, dtype=bool)
+        step = np.zeros(joints.size)
+        for _ in range(joints.size):
+            reduced = jacobian * free
+            square = reduced @ reduced.T
+            square[np.diag_indices_from(square)] += self.damping**2
+            inverse = np.linalg.solve(square, reduced).T
+            step = inverse @ error
+            if posture is not None:
+                pull = self.posture_gain * (posture - joints) * free
+                step = step + pull - inverse @ (reduced @ pull)
+            largest = np.abs(step).max()
+            if largest > self.max_step:
+                step = step * (self.max_step / largest)
+            over = free & ((joints + step > high) | (joints + step < low))
+            at_limit = over & ((joints >= high - 1e-9) | (joints <= low + 1e-9))
+            if not at_limit.any():
+                break
+            free &= ~at_limit
+        return np.clip(joints + step, low, high) - joints
+
+    def find_posture(
+        self,
+        qpos: ArrayLike,
+        position: ArrayLike,
+        rotation: ArrayLike | None = None,
+        *,
+        near: ArrayLike,
+        rng: np.random.Generator,
+        restarts: int = 64,
+        iterations: int = 60,
+        tolerance: float = 5e-3,
+    ) -> NDArray[np.float64]:
+        """Search a configuration that reaches a pose without touching anything.
+
+        Starts from random joint positions, solves, and of the solutions free of
+        contacts takes the one with the least largest change from `near`.
+
+        Args:
+            qpos: positions of the whole model, `[nq]`.
+            position: target of the tool point, `[3]`, metres.
+            rotation: target rotation matrix `[3, 3]`; free where None.
+
+        Keyword Args:
+            near: joint positions `[J]` that the result should be close to.
+            rng: source of the random starts.
+            restarts: number of random starts.
+            iterations: iterations per start.
+            tolerance: largest position error of a solution, metres.
+
+        Returns:
+            joint positions `[J]`.
+
+        Raises:
+            RuntimeError: no start led to a collision-free solution.
+        """
+        centre = np.asarray(near, dtype=np.float64)
+        configuration = np.array(qpos, dtype=np.float64)
+        best: NDArray[np.float64] | None = None
+        best_cost = np.inf
+        for attempt in range(restarts):
+            spread = 0.0 if attempt == 0 else 1.5 * attempt / restarts
+            start = centre + spread * rng.standard_normal(centre.size)
+            configuration[self.qpos_index] = np.clip(start, *self.limits.T)
+            solution = self.solve(
+                configuration, position, rotation, iterations=iterations
+            )
+            if (
+                solution.position_error > tolerance
+                or solution.rotation_error > 10 * tolerance
+            ):
+                continue
+            cost = float(np.abs(solution.joints - centre).max())
+            if cost >= best_cost:
+                continue
+            configuration[self.qpos_index] = solution.joints
+            if self.in_collision(configuration):
+                continue
+            best, best_cost = solution.joints, cost
+        if best is None:
+            raise RuntimeError(
+                f"no collision-free posture in {restarts} starts for the tool at "
+                f"{np.asarray(position).round(3).tolist()}; use more restarts, or a "
+                "target farther from the furniture"
+            )
+        return best
+
+    def in_collision(self, qpos: ArrayLike) -> bool:
+        """Tell whether the solver's part of the robot touches something.
+
+        Args:
+            qpos: positions of the whole model, `[nq]`.
+
+        Returns:
+            True where a body that the solver's joints move penetrates another body,
+            one of the robot's own included.
+        """
+        self.data.qpos[:] = qpos
+        self._mujoco.mj_kinematics(self.model, self.data)
+        self._mujoco.mj_collision(self.model, self.data)
+        for contact in self.data.contact[: self.data.ncon]:
+            bodies = self.model.geom_bodyid[contact.geom]
+            if contact.dist < 0 and self._moved[bodies].any():
+                return True
+        return False
