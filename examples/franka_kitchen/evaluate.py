@@ -1,0 +1,112 @@
+"""Asks a trained agent for each task, from the default start (the cabinet is closed).
+
+Run after ``train.py``: ``python evaluate.py arm=caiac seed=0``. Success means that
+*all* objects are where the goal wants them (paper, A.6.1).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from torchrl.envs import SerialEnv, TransformedEnv
+from tqdm.auto import tqdm
+from train import Arm, run_folder, train
+
+from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv, make_kitchen_env
+from torchrl_caiac.modules import LMPActor, LMPModel
+from torchrl_caiac.plotting import plot_frames
+
+_LOGGER = logging.getLogger(__name__)
+
+
+def evaluate_task(
+    model: LMPModel, task: str, *, episodes: int, seed: int, strips: int, folder: Path
+) -> list[dict[str, Any]]:
+    """Plays episodes of one task side by side; one result an episode."""
+    torch.manual_seed(seed)
+    actor = LMPActor(model)
+    base = SerialEnv(episodes, partial(make_kitchen_env, task))
+    env = TransformedEnv(base, actor.make_tensordict_primer())
+    env.set_seed(seed)
+    try:
+        with torch.no_grad():
+            rollout = env.rollout(10_000, actor, break_when_all_done=True)
+    finally:
+        env.close()
+    after = rollout["next"]
+    results = []
+    for number in range(episodes):
+        done = after["done"][number, :, 0].nonzero()
+        length = int(done[0]) + 1
+        wrong = after["wrong_tasks"][number, length - 1]
+        results.append(
+            {
+                "task": task,
+                "episode": number,
+                "success": bool(after["success"][number, length - 1]),
+                "task_success": bool(after["task_success"][number, :length].any()),
+                "wrong_tasks": [
+                    name
+                    for name, was_done in zip(KITCHEN_TASKS, wrong, strict=True)
+                    if was_done
+                ],
+                "steps": length,
+            }
+        )
+        if number < strips:
+            shown = torch.linspace(0, length - 1, 6).round().long()
+            kitchen = KitchenEnv(task, render_mode="rgb_array")
+            try:
+                frames = kitchen.render_states(
+                    after["observation"][number, shown].numpy()
+                )
+            finally:
+                kitchen.close()
+            figure = plot_frames(frames, [f"step {int(i) + 1}" for i in shown])
+            figure.savefig(folder / f"{task}-{number}.png", dpi=150)
+    return results
+
+
+def evaluate(cfg: DictConfig, arm: Arm, seed: int) -> list[dict[str, Any]]:
+    """Evaluates one trained arm on all tasks; writes ``evaluation.json`` beside it."""
+    model = train(cfg, arm, seed)
+    folder = run_folder(cfg, arm, seed)
+    results: list[dict[str, Any]] = []
+    for task in tqdm(cfg.evaluate.tasks, desc=f"{folder.name} plays", unit="task"):
+        results += evaluate_task(
+            model,
+            task,
+            episodes=cfg.evaluate.episodes,
+            seed=cfg.evaluate.seed + seed,
+            strips=cfg.evaluate.strips,
+            folder=folder,
+        )
+    for result in results:
+        result |= {"arm": arm, "seed": seed}
+    path = folder / "evaluation.json"
+    partial_path = path.with_suffix(".partial")
+    partial_path.write_text(json.dumps(results, indent=1) + "\n")
+    partial_path.replace(path)
+    for task in cfg.evaluate.tasks:
+        mine = [result for result in results if result["task"] == task]
+        share = sum(result["success"] for result in mine) / len(mine)
+        _LOGGER.info("%s: %s solved in %.0f %%", folder.name, task, 100 * share)
+    return results
+
+
+@hydra.main(version_base=None, config_path=".", config_name="config")
+def main(cfg: DictConfig) -> None:
+    """Evaluates ``cfg.arm`` with ``cfg.seed``."""
+    torch.set_num_threads(1)
+    evaluate(cfg, cfg.arm, cfg.seed)
+
+
+if __name__ == "__main__":
+    main()

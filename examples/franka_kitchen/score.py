@@ -1,0 +1,101 @@
+"""Scores every row of the demonstrations, and compares scores with the truth.
+
+Run after ``fit_world_model.py``: ``python score.py``. The learned scores go into the
+leaf ``("caiac", "score")`` of the demonstrations; ``arm=oracle`` also asks the
+simulator for their truth and keeps it in ``truth.pt``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from fit_world_model import fit
+from omegaconf import DictConfig
+from settings import keep_settings
+from tensordict import TensorDictBase
+
+from torchrl_caiac.data import load_transitions, offline_buffer
+from torchrl_caiac.envs import KitchenEnv
+from torchrl_caiac.influence import (
+    CAI,
+    influence_report,
+    score_buffer,
+    true_influence,
+)
+
+_LOGGER = logging.getLogger(__name__)
+
+
+def simulator_truth(data: TensorDictBase, path: Path, cfg: DictConfig) -> torch.Tensor:
+    """Which entities the action can move in each row, bool ``[T, N]``; kept on disk."""
+    if not path.exists():
+        states = torch.cat([data["sim", "qpos"], data["sim", "qvel"]], -1)
+        truth = true_influence(
+            KitchenEnv,
+            states,
+            num_actions=cfg.score.truth_actions,
+            num_workers=cfg.collect.workers,
+        )
+        partial = path.with_suffix(".partial")
+        torch.save(truth.influenced, partial)
+        partial.replace(path)
+    influenced = torch.load(path, weights_only=True)
+    if influenced.shape != (len(data), len(KitchenEnv.layout)):
+        raise ValueError(
+            f"{path} has the shape {list(influenced.shape)}, the data have {len(data)} "
+            "rows: it is of other data, delete it"
+        )
+    return influenced
+
+
+def score(cfg: DictConfig) -> dict[str, Any]:
+    """Scores the demonstrations and reports how good scores are on held-out ones."""
+    keep_settings(cfg, "score")
+    settings = cfg.score
+    out = Path(cfg.out)
+    estimator = CAI(fit(cfg), num_actions=settings.num_actions)
+    options = {"batch_size": settings.batch_size, "smoothing": settings.smoothing}
+    demonstrations = load_transitions(out / "demonstrations")
+    score_buffer(
+        offline_buffer(demonstrations, batch_size=1),
+        estimator,
+        lookahead=settings.lookahead,
+        **options,
+    )
+    if cfg.arm == "oracle":
+        simulator_truth(demonstrations, out / "truth.pt", cfg)
+    held_out = load_transitions(out / "held_out")
+    # The truth is about a row's own state, so the next one is left out here.
+    score_buffer(
+        offline_buffer(held_out, batch_size=1), estimator, lookahead=0, **options
+    )
+    scores = load_transitions(out / "held_out")["caiac", "score"]
+    report: dict[str, Any] = dict(
+        influence_report(
+            scores,
+            simulator_truth(held_out, out / "held_out_truth.pt", cfg),
+            KitchenEnv.layout.names,
+            threshold=settings.threshold,
+        )
+    )
+    path = out / "influence.json"
+    path.write_text(json.dumps(report, indent=1) + "\n")
+    for name in ("microwave", "kettle"):
+        _LOGGER.info("%s: %s", name, report[name])
+    return report
+
+
+@hydra.main(version_base=None, config_path=".", config_name="config")
+def main(cfg: DictConfig) -> None:
+    """Scores the demonstrations."""
+    torch.set_num_threads(1)
+    score(cfg)
+
+
+if __name__ == "__main__":
+    main()
