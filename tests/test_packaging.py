@@ -22,10 +22,13 @@ else:
 
 ROOT = Path(__file__).parents[1]
 # A room is the package itself, a sub-package, or a public module beside them.
-ROOMS = ["torchrl_caiac"] + sorted(
-    f"torchrl_caiac.{module.name}"
-    for module in pkgutil.iter_modules(torchrl_caiac.__path__)
-    if module.name != "entities"  # the package's own names
+ROOMS = sorted(
+    ["torchrl_caiac"]
+    + [
+        f"torchrl_caiac.{module.name}"
+        for module in pkgutil.iter_modules(torchrl_caiac.__path__)
+        if module.name != "entities"  # the package's own names
+    ]
 )
 PUBLIC = [
     (room, name) for room in ROOMS for name in importlib.import_module(room).__all__

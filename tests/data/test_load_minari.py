@@ -40,7 +40,15 @@ def parts(rng: np.random.Generator, length: int) -> dict:
     return {"arm": arrays(rng, length + 1, 2), "cup": arrays(rng, length + 1, 1)}
 
 
+def taken(rng: np.random.Generator, length: int) -> dict:
+    return {
+        "observation": arrays(rng, length + 1, 2),
+        "episode": arrays(rng, length + 1, 1),
+    }
+
+
 SPACES = {
+    taken: spaces.Dict({"observation": box(2), "episode": box(1)}),
     flat: box(3),
     goal_env: spaces.Dict(
         {
@@ -172,9 +180,21 @@ def missing_state(number, buffer):
         object.__setattr__(buffer, "observations", buffer.observations[:-1])  # frozen
 
 
+def overflow(number, buffer):
+    if number == 2:
+        buffer.actions[0, 0] = 1e300
+
+
+def narrow_action(number, buffer):
+    if number == 1:
+        object.__setattr__(buffer, "actions", buffer.actions[:, :1])
+
+
 @pytest.mark.parametrize(
     ("spoil", "match"),
     [
+        (overflow, "'action' in episode 2 .*infinite"),
+        (narrow_action, r"episode 1 .*differ.*\['action'\]"),
         (nan_observation, "'observation' in episode 1 .*NaN"),
         (inf_action, "'action' in episode 2 .*infinite"),
         (missing_state, "'observation' in episode 2 .*has 6 entries, wanted 7"),
@@ -185,6 +205,12 @@ def test_bad_episodes_leave_nothing(spoil, match, tmp_path):
     with pytest.raises(ValueError, match=match):
         load_minari(dataset, tmp_path / "rows", progress=False)
     assert [path.name for path in tmp_path.iterdir()] == ["minari"]
+
+
+def test_an_entry_named_as_a_key_of_transitions(tmp_path):
+    dataset, _ = make_dataset(taken)
+    with pytest.raises(ValueError, match=r"entries named \['episode'\]"):
+        load_minari(dataset, tmp_path / "rows", progress=False)
 
 
 def test_arguments(tmp_path):

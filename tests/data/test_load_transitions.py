@@ -39,7 +39,7 @@ def test_what_was_written_is_read(tmp_path):
 def test_a_truncated_file_is_noticed_and_left_as_it_is(name, size, tmp_path):
     rows().memmap(tmp_path / "data")
     file = tmp_path / "data" / f"{name}.memmap"
-    file.write_bytes((file.read_bytes() * 100)[:size])
+    file.write_bytes((file.read_bytes() * 200)[:size])
     with pytest.raises(ValueError, match=f"has {size} bytes, wanted") as error:
         load_transitions(tmp_path / "data")
     assert "make the data again" in str(error.value)

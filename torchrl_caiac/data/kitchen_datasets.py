@@ -28,6 +28,7 @@ from torchrl_caiac.data.collect import (
     load_episode,
     record_episode,
 )
+from torchrl_caiac.data.load_transitions import load_transitions
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -435,8 +436,6 @@ def kitchen_transitions(
 
 def _memmap(rows: TensorDict, path: Path) -> TensorDict:
     """Write rows beside their place and move them there when they are whole."""
-    from tensordict import TensorDict
-
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
     try:
@@ -446,7 +445,7 @@ def _memmap(rows: TensorDict, path: Path) -> TensorDict:
         os.replace(partial / "rows", path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return TensorDict.load_memmap(path)
+    return load_transitions(path)
 
 
 # Sources of episodes. They live in worker processes, made there by their factories.
@@ -629,10 +628,11 @@ def _same_array(file: Path, array: NDArray[Any]) -> bool:
 
 def _dataset_path(dataset_id: str, root: str | os.PathLike[str] | None) -> Path:
     if root is not None:
-        return Path(root) / dataset_id
+        # Minari loses its way from a relative one.
+        return Path(root).absolute() / dataset_id
     from minari.storage import get_dataset_path
 
-    return Path(get_dataset_path(dataset_id))
+    return Path(get_dataset_path(dataset_id)).absolute()
 
 
 def _free_target(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tqdm.auto import tqdm
 
 from torchrl_caiac.data.load_transitions import load_transitions
@@ -127,14 +127,22 @@ def _fill(
         part["episode"] = torch.full((length,), number)
         if rows is None:
             rows = part[:1].expand(sum(lengths)).memmap_like(folder)
-        try:
-            rows[first : first + length] = part
-        except (KeyError, RuntimeError) as error:
+        # A memmap would broadcast, cast or leave out what does not fit, silently.
+        differ = {leaf[0] for leaf in _structure(part) ^ _structure(rows)}
+        if differ:
             raise ValueError(
-                f"episode {episode.id} of {dataset.id} has other entries or shapes "
-                f"than the first one: {error}"
-            ) from error
+                f"episode {episode.id} of {dataset.id} and the first one differ in the "
+                f"shapes or types of {sorted(differ, key=str)}: load them apart"
+            )
+        rows[first : first + length] = part
         first += length
+
+
+def _structure(rows: TensorDictBase) -> set[tuple[Any, ...]]:
+    return {
+        (key, leaf.dtype, tuple(leaf.shape[1:]))
+        for key, leaf in rows.items(include_nested=True, leaves_only=True)
+    }
 
 
 def _transitions(
@@ -150,6 +158,12 @@ def _transitions(
     states = episode.observations
     if not isinstance(states, Mapping) or "observation" not in states:
         states = {"observation": states}
+    taken = sorted({"action", "episode", "info", "next"} & set(states))
+    if taken:
+        raise ValueError(
+            f"the observations in {where} have entries named {taken}, which are keys "
+            "of transitions: rename them in the dataset"
+        )
     if columns is not None:
         states = {**states, "observation": _columns(states, columns, where)}
     flags = {
@@ -215,18 +229,24 @@ def _tensors(
         if isinstance(value, Mapping):
             result[key] = _tensors(value, length, where, part, cast=cast)
             continue
+        if isinstance(value, tuple):
+            raise ValueError(
+                f"{key!r} in {where} is a tuple of spaces, which has no keys: make a "
+                "dict of it"
+            )
         array = np.asarray(value)
         if len(array) != length:
             raise ValueError(
                 f"{key!r} in {where} has {len(array)} entries, wanted {length}"
             )
         if np.issubdtype(array.dtype, np.floating):
+            with np.errstate(over="ignore"):
+                array = array.astype(np.float32) if cast else array
             if not np.isfinite(array).all():
                 raise ValueError(
-                    f"{key!r} in {where} has NaN or infinite values: leave the episode "
-                    "out, say with MinariDataset.filter_episodes"
+                    f"{key!r} in {where} has NaN or infinite values (as float32): "
+                    "leave the episode out, say with MinariDataset.filter_episodes"
                 )
-            array = array.astype(np.float32) if cast else array
         # A copy: what Minari hands out may be read-only.
         result[key] = torch.from_numpy(np.array(array[part]))
     return result

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Literal
 
 import torch
@@ -12,7 +10,10 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import Bounded
 
-from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+from torchrl_caiac.modules.gaussian_world_model import (
+    GaussianWorldModel,
+    evaluating,
+)
 
 __all__ = ["CAI", "causal_action_influence", "draw_actions"]
 
@@ -290,7 +291,7 @@ class CAI(nn.Module):
             len(state), self.model.layout.num_entities, device=state.device
         )
         rows, actions = self._chunk()
-        with _evaluating(self.model):
+        with evaluating(self.model):
             for start in range(0, len(state), rows):
                 part = state[start : start + rows]
                 self.model.check_finite(part, first_row=start)
@@ -357,14 +358,3 @@ def _bounds(spec: Bounded | None, size: int) -> tuple[torch.Tensor, torch.Tensor
             f"{high.tolist()}: give finite ones"
         )
     return low, high
-
-
-@contextmanager
-def _evaluating(module: nn.Module) -> Iterator[None]:
-    modes = [(part, part.training) for part in module.modules()]
-    module.eval()
-    try:
-        yield
-    finally:
-        for part, training in modes:
-            part.training = training

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -525,6 +526,18 @@ class GaussianWorldModel(TensorDictModuleBase):
             return self.predict
         columns = self.layout.columns
         return {n: tuple(columns[n][p] for p in ps) for n, ps in self.predict.items()}
+
+
+@contextmanager
+def evaluating(module: nn.Module) -> Iterator[None]:
+    """Puts a module in evaluation mode, and each part back as it was."""
+    modes = [(part, part.training) for part in module.modules()]
+    module.eval()
+    try:
+        yield
+    finally:
+        for part, training in modes:
+            part.training = training
 
 
 def _orthogonal(layer: nn.Linear) -> nn.Linear:

@@ -13,7 +13,10 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
-from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+from torchrl_caiac.modules.gaussian_world_model import (
+    GaussianWorldModel,
+    evaluating,
+)
 
 __all__ = ["EntityDynamicsLoss", "gaussian_nll"]
 
@@ -196,16 +199,11 @@ class EntityDynamicsLoss(LossModule):
             mean over rows and the entity's predicted columns.
         """
         model, layout = self.model, self.model.layout
-        training = self.training
-        self.eval()
-        try:
-            with self._parameters_in():
-                state = layout.read(tensordict)
-                loc, _ = model.forward_tensors(
-                    state, tensordict.get(self.tensor_keys.action)
-                )
-        finally:
-            self.train(training)
+        with evaluating(model), self._parameters_in():
+            state = layout.read(tensordict)
+            loc, _ = model.forward_tensors(
+                state, tensordict.get(self.tensor_keys.action)
+            )
         after = layout.read(tensordict, next=True)[..., model.index]
         error = (model.physical(state, loc) - after).square()
         return TensorDict(
