@@ -60,6 +60,7 @@ bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
 	    --device=$(DEVICE) --benchmark-json=benchmark-$(DEVICE).json
 
 docs: setup ## build the documentation, warnings are errors
+	rm -rf docs/reference/generated
 	MPLBACKEND=agg OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going \
 	    -b html docs docs/_build/html
 

@@ -2,7 +2,7 @@
 
 Run after ``fit_world_model.py``: ``python score.py``. The learned scores go into the
 leaf ``("caiac", "score")`` of the demonstrations; ``arm=oracle`` also asks the
-simulator for their truth and keeps it in ``truth.pt``.
+simulator for their truth, ``("oracle", "score")``.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ import torch
 from fit_world_model import fit
 from omegaconf import DictConfig
 from settings import keep_settings
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
+from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.envs import KitchenEnv
 from torchrl_caiac.influence import (
     CAI,
     influence_report,
+    oracle_score,
     score_buffer,
     true_influence,
 )
@@ -53,6 +55,34 @@ def simulator_truth(data: TensorDictBase, path: Path, cfg: DictConfig) -> torch.
     return influenced
 
 
+class _Truth:
+    """Scores of rows whose observation is the truth."""
+
+    layout = EntityLayout({name: [i] for i, name in enumerate(KitchenEnv.layout.names)})
+
+    def __call__(self, td: TensorDictBase) -> torch.Tensor:
+        return td["observation"]
+
+
+def store_oracle(
+    data: TensorDictBase, influenced: torch.Tensor, lookahead: int
+) -> None:
+    """Adds the truth as scores, with the lookahead of the learned ones."""
+    truth = oracle_score(influenced)
+    after = TensorDict({"observation": truth, "done": data["next", "done"]}, data.shape)
+    rb = offline_buffer(
+        TensorDict(
+            {"observation": truth, "episode": data["episode"], "next": after},
+            data.shape,
+        )
+    )
+    score_buffer(rb, _Truth(), lookahead=lookahead, progress=False)
+    scores = rb.storage[:]["caiac", "score"]
+    if data.get(("oracle", "score"), None) is None:
+        data.make_memmap(("oracle", "score"), shape=scores.shape, dtype=scores.dtype)
+    data["oracle", "score"].copy_(scores)
+
+
 def score(cfg: DictConfig) -> dict[str, Any]:
     """Scores the demonstrations and reports how good scores are on held-out ones."""
     keep_settings(cfg, "score")
@@ -67,8 +97,9 @@ def score(cfg: DictConfig) -> dict[str, Any]:
         lookahead=settings.lookahead,
         **options,
     )
-    if cfg.arm == "oracle":
-        simulator_truth(demonstrations, out / "truth.pt", cfg)
+    if "oracle" in (cfg.arm, *cfg.demo.arms):
+        influenced = simulator_truth(demonstrations, out / "truth.pt", cfg)
+        store_oracle(demonstrations, influenced, settings.lookahead)
     held_out = load_transitions(out / "held_out")
     # The truth is about a row's own state, so the next one is left out here.
     score_buffer(

@@ -29,7 +29,6 @@ from tqdm.auto import tqdm
 from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
-from torchrl_caiac.influence import oracle_score
 from torchrl_caiac.modules import LMPModel
 from torchrl_caiac.objectives import LMPLoss
 from torchrl_caiac.transforms import WindowGoal
@@ -45,10 +44,6 @@ def make_buffer(
 ) -> TensorDictReplayBuffer:
     """The replay buffer of an arm: windows, their goals, and counterfactuals."""
     settings = cfg.train
-    if arm == "oracle":
-        truth = torch.load(Path(cfg.out) / "truth.pt", weights_only=True)
-        # A copy of the tensordict, not of its leaves: the files stay as they are.
-        data = data.copy().set(SCORE_KEYS["oracle"], oracle_score(truth))
     goals = WindowGoal(
         KitchenEnv.layout,
         window=settings.window,

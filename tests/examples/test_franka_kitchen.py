@@ -85,6 +85,11 @@ def test_scores_and_their_report(cfg):
     truth = torch.load(Path(cfg.out) / "truth.pt", weights_only=True)
     cabinet = KitchenEnv.layout.index("slide_cabinet")
     assert truth.shape == data["caiac", "score"].shape
+    # The oracle's score: whether the action moves the entity now or later on.
+    for episode in data["episode"].unique():
+        rows = data["episode"] == episode
+        later = truth[rows].flip(0).cummax(0).values.flip(0)
+        assert torch.equal(data["oracle", "score"][rows].bool(), later)
     assert not truth[:, cabinet].any()
     assert truth[:, KitchenEnv.layout.index("microwave")].any()
 
