@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 from tensordict import TensorDict, TensorDictBase
 
 FLAT_LENGTHS = (7, 12, 9, 5)
@@ -13,8 +14,10 @@ STATE_WIDTH, ACTION_WIDTH, GOAL_WIDTH = 9, 2, 4
 
 
 def pytest_configure() -> None:
-    """Tests share the machine with each other: one thread each."""
+    """Tests share the machine with each other: one thread each, and no deadline."""
     torch.set_num_threads(1)
+    settings.register_profile("shared", deadline=None)
+    settings.load_profile("shared")
 
 
 def pytest_collection_modifyitems(

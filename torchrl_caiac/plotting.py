@@ -132,7 +132,7 @@ def plot_influence(
         >>> len(figure.axes)
         1
     """
-    values = np.array(scores, dtype=np.float64)
+    values = np.asarray(scores, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] != len(names) or not len(values):
         raise ValueError(
             f"scores have shape {values.shape}, wanted [L, {len(names)}] with a row at "
@@ -140,7 +140,7 @@ def plot_influence(
         )
     contact: NDArray[np.bool_] | None = None
     if truth is not None:
-        contact = np.array(truth)
+        contact = np.asarray(truth)
         if contact.shape != values.shape or contact.dtype != np.bool_:
             raise ValueError(
                 f"truth has shape {contact.shape} and dtype {contact.dtype}, wanted "
@@ -281,7 +281,7 @@ def plot_success(
         ...         "caiac": {"kettle": [1.0, 1.0], "microwave": [0.9, 1.0]},
         ...     }
         ... )
-        >>> [bar.get_height() for bar in figure.axes[0].containers[0]]
+        >>> [round(float(bar.get_height()), 3) for bar in figure.axes[0].containers[0]]
         [0.95, 0.025]
     """
     labels = labels or {}

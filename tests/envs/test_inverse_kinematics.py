@@ -155,7 +155,7 @@ def test_find_posture_avoids_the_wall(model, solver):
 
 def test_in_collision_sees_the_wall(model, solver):
     assert solver.in_collision(start(model, (np.pi / 2, 0.0, 0.0))) is False
-    wall = mujoco.MjModel.from_xml_string(ARM.replace('pos="0 2.6 0"', 'pos="0 1.6 0"'))
+    wall = mujoco.MjModel.from_xml_string(ARM.replace('pos="0 2.6 0"', 'pos="0 2.5 0"'))
     closer = InverseKinematics(wall, "tip", ["a", "b", "c"])
     assert closer.in_collision(start(wall, (np.pi / 2, 0.0, 0.0))) is True
     assert closer.in_collision(start(wall, (0.0, 0.0, 0.0))) is False

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss
 from torchrl_caiac.objectives.fit_world_model import fit_world_model
@@ -58,7 +59,7 @@ def assert_equal(a: GaussianWorldModel, b: GaussianWorldModel) -> None:
 
 
 def test_learns_the_dynamics_and_where_the_cup_moves() -> None:
-    data, model = world(4000), make(hidden_sizes=(64, 64))
+    data, model = world(4000), make(hidden_sizes=(64, 64), variance_floor=0.02)
     history = fit(model, data, steps=800, eval_every=200, batch_size=256, lr=3e-3)
     assert history["step"].tolist() == [200, 400, 600, 800]
     mse = history["validation_mse"][-1]
@@ -68,6 +69,13 @@ def test_learns_the_dynamics_and_where_the_cup_moves() -> None:
     own = EntityDynamicsLoss(model).entity_mse(fresh)
     assert own["arm"] < 2e-5 and own["cup"] < 6e-4
     assert not model.training
+    # And the influence that follows from it is the truth: where the arm touches.
+    state = fresh["observation"]
+    truth = (state[:, 0] - state[:, 2]).abs() < 0.5
+    arm, cup = CAI(model, num_actions=32)(fresh).unbind(-1)
+    pairs = cup[truth][:, None] - cup[~truth][None]
+    assert (pairs > 0).float().mean() > 0.95
+    assert arm.min() > 1 and cup[~truth].median() < 0.1 < 0.5 < cup[truth].median()
 
 
 def test_history_agrees_with_the_loss_on_the_held_out_rows() -> None:

@@ -479,6 +479,8 @@ def _make_env(tasks: Sequence[str]) -> Any:
         # Whole motions, and rewards that do not depend on what happened before.
         terminate_on_tasks_completed=False,
         remove_task_when_completed=False,
+        # It warns of views of simulator memory, which record_episode copies.
+        disable_env_checker=True,
     )
 
 

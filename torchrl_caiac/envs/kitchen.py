@@ -507,7 +507,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
                     )
                 state[columns] = values
         else:
-            state = np.array(start, dtype=np.float64)
+            state = np.asarray(start, dtype=np.float64).copy()
             if state.shape != (30,):
                 raise ValueError(
                     f"start has shape {state.shape}, wanted (30,): 9 robot joints and "
@@ -811,7 +811,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         if isinstance(state, KitchenState):
             vector, physics = np.zeros(width), state.physics
         else:
-            vector, physics = np.array(state, dtype=np.float64), None
+            vector, physics = np.asarray(state, dtype=np.float64), None
             if vector.shape == (model.nq,):
                 vector = np.concatenate((vector, np.zeros(model.nv)))
             if vector.shape != (width,):
@@ -914,7 +914,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
             goal = base[_OBJECTS].copy()
             goal[_TASK_COLUMNS[self.task] - 9] = _TASK_GOALS[self.task]
             return goal
-        goal = np.array(option, dtype=np.float64)
+        goal = np.asarray(option, dtype=np.float64).copy()
         if goal.shape != (21,) or not np.isfinite(goal).all():
             raise ValueError(
                 f"goal has shape {goal.shape}, wanted (21,) and finite: columns 9 to "

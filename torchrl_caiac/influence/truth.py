@@ -322,10 +322,11 @@ def _pair(score: Any, truth: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_
         raise ValueError(f"truth has dtype {mask.dtype}, wanted bool")
     if not len(values):
         raise ValueError("score is empty")
-    if np.isnan(values).any():
+    bad = int((~np.isfinite(values)).sum())
+    if bad:
         raise ValueError(
-            f"score is NaN (not scored) in {int(np.isnan(values).sum())} rows: score "
-            "them, or drop them here"
+            f"score is NaN (not scored) or infinite in {bad} rows: score them, or drop "
+            "them here"
         )
     return values, mask
 
@@ -334,7 +335,7 @@ def roc_auc(score: ArrayLike | torch.Tensor, truth: ArrayLike | torch.Tensor) ->
     """Return the area under the ROC curve of a score.
 
     Args:
-        score: ``[S]``; higher means more influence. Ties count half.
+        score: ``[S]``, finite; higher means more influence. Ties count half.
         truth: bool ``[S]``.
 
     Returns:
@@ -365,7 +366,7 @@ def best_threshold(
     one in the middle of the widest gap between scores is taken.
 
     Args:
-        score: ``[S]``.
+        score: ``[S]``, finite.
         truth: bool ``[S]``.
 
     Returns:
@@ -382,18 +383,14 @@ def best_threshold(
     if not positives or not negatives:
         return float("nan"), float("nan")
     levels, inverse = np.unique(values, return_inverse=True)
-    if len(levels) == 1:
-        return float(levels[0]), 0.5
-    # Cutting above level i: what lies at or below it is called uninfluenced.
-    misses = np.cumsum(np.bincount(inverse, weights=mask))[:-1]
-    rejected = np.cumsum(np.bincount(inverse, weights=~mask))[:-1]
+    # Cutting above level i: what lies at or below it is called uninfluenced. The last
+    # cut calls nothing influenced.
+    misses = np.cumsum(np.bincount(inverse, weights=mask))
+    rejected = np.cumsum(np.bincount(inverse, weights=~mask))
     accuracy = ((1 - misses / positives) + rejected / negatives) / 2
-    gaps = np.nan_to_num(np.diff(levels), posinf=np.finfo(np.float64).max)
+    gaps = np.append(np.diff(levels), 0.0)
     best = int(np.lexsort((gaps, accuracy))[-1])
-    middle = levels[best] / 2 + levels[best + 1] / 2
-    if not np.isfinite(middle):
-        finite = levels[best : best + 2][np.isfinite(levels[best : best + 2])]
-        middle = finite[0] if len(finite) else 0.0
+    middle = (levels[best] + levels[min(best + 1, len(levels) - 1)]) / 2
     return float(middle), float(accuracy[best])
 
 
@@ -406,7 +403,7 @@ def influence_report(
     """Judge a score by the truth, entity by entity.
 
     Args:
-        scores: ``[S, N]``, no NaN.
+        scores: ``[S, N]``, finite.
         truth: bool ``[S, N]``, of :func:`true_influence`.
         names: the ``N`` entities.
         threshold: θ; influenced is what scores above it.

@@ -322,7 +322,8 @@ class _Fit:
         settings: dict[str, Any],
     ) -> None:
         self.model = model
-        self.optimizer = torch.optim.Adam(model.parameters(), lr=lr)
+        fused = model.loc_head.weight.device.type in ("cpu", "cuda")
+        self.optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=fused)
         self.generator = generator
         self.settings = settings
         self.step = 0

@@ -1,0 +1,65 @@
+"""Configuration of Sphinx."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+
+import torchrl_caiac
+
+project = "torchrl-caiac"
+author = "torchrl-caiac contributors"
+copyright = "2026, torchrl-caiac contributors"
+version = release = importlib.metadata.version("torchrl-caiac")
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
+]
+templates_path = ["_templates"]
+exclude_patterns = ["_build", "tutorials"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+
+# The reference: every name in the __all__ of every room, nothing else.
+autosummary_generate = True
+autosummary_ignore_module_all = False
+autosummary_imported_members = True
+# What the package itself exports is described in its room, if it has one.
+_ROOMS = ("data", "envs", "influence", "modules", "objectives", "transforms")
+autosummary_context = {
+    "rooms": {
+        name: f"torchrl_caiac.{room}.{name}"
+        for room in _ROOMS
+        for name in importlib.import_module(f"torchrl_caiac.{room}").__all__
+        if name in torchrl_caiac.__all__
+    }
+}
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # in the signature's place: the Args sections
+add_module_names = False
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_attr_annotations = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+napoleon_custom_sections = [("Keyword Args", "params_style")]
+
+sphinx_gallery_conf = {
+    "examples_dirs": "tutorials",
+    "gallery_dirs": "auto_tutorials",
+    "filename_pattern": r"plot_",
+    "remove_config_comments": True,
+    "show_memory": False,
+    "download_all_examples": False,
+    "abort_on_example_error": True,
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "torchrl-caiac"
+html_show_sourcelink = False
+html_theme_options = {"show_prev_next": False, "navigation_with_keys": False}

@@ -1,0 +1,281 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.envs.kitchen import KitchenEnv
+from torchrl_caiac.influence.truth import (
+    best_threshold,
+    draw_actions,
+    influence_report,
+    oracle_score,
+    roc_auc,
+    true_influence,
+)
+
+
+class Box:
+    low, high = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
+
+
+class Table:
+    """A hand drags a cup that it holds; a ball rolls on by itself.
+
+    State: hand, cup, ball, ball velocity, held (0 or 1).
+    """
+
+    layout = EntityLayout({"hand": [0], "cup": [1], "ball": [2, 3]}, fixed=("hand",))
+    action_space = Box()
+
+    def outcomes(self, state, actions, *, horizon=1):
+        after = np.tile(np.asarray(state, dtype=np.float64), (len(actions), 1))
+        for _ in range(horizon):
+            after[:, 0] += actions[:, 0]
+            after[:, 1] += after[:, 4] * actions[:, 0]
+            after[:, 2] += after[:, 3]
+        return after
+
+
+HELD = [0.0, 0.0, 0.0, 5.0, 1.0]
+FREE = [0.0, 0.0, 0.0, 5.0, 0.0]
+
+
+class TestTrueInfluence:
+    def test_what_is_held_is_influenced(self):
+        truth = true_influence(Table(), [HELD, FREE], progress=False)
+        assert truth.influenced.dtype == torch.bool
+        assert truth.influenced.tolist() == [[True, True, False], [True, False, False]]
+        assert truth.displacement.dtype == torch.float32
+        actions = draw_actions(Box.low, Box.high, 16)
+        spread = float(np.ptp(actions[:, 0]))
+        assert truth.displacement[0, 1].item() == pytest.approx(spread)
+        # moves by 5 under any action: not influenced
+        assert truth.displacement[:, 2].tolist() == [0.0, 0.0]
+
+    def test_threshold(self):
+        for threshold, expected in ((1e-3, True), (3.0, False)):
+            truth = true_influence(Table(), [HELD], threshold=threshold, progress=False)
+            assert truth.influenced[0].tolist() == [True, expected, False]
+        truth = true_influence(
+            Table(), [HELD], threshold={"cup": 3.0, "ball": 1e-3}, progress=False
+        )
+        assert truth.influenced[0].tolist() == [True, False, False]
+
+    def test_horizon(self):
+        one = true_influence(Table(), [HELD], progress=False).displacement
+        three = true_influence(Table(), [HELD], horizon=3, progress=False).displacement
+        assert torch.allclose(three, 3 * one)
+
+    def test_inputs(self):
+        states = np.array([HELD, FREE])
+        expected = true_influence(Table(), states, progress=False)
+        for same in (torch.tensor(states), states.tolist(), [np.array(HELD), FREE]):
+            truth = true_influence(Table(), same, progress=False)
+            assert torch.equal(truth.displacement, expected.displacement)
+        made = true_influence(Table, states, progress=False)
+        assert torch.equal(made.displacement, expected.displacement)
+
+    def test_seed(self):
+        def displacement(seed):
+            return true_influence(
+                Table(), [HELD], seed=seed, progress=False
+            ).displacement
+
+        assert torch.equal(displacement(1), displacement(1))
+        assert not torch.equal(displacement(1), displacement(2))
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"states": np.zeros((0, 5))}, "empty"),
+            ({"states": np.array([HELD, [np.nan] * 5])}, "1 rows, the first at 1"),
+            ({"num_actions": 1}, "at least 2"),
+            ({"num_workers": -1}, "0 or more"),
+            ({"num_workers": 1}, "picklable function"),
+            ({"threshold": 0.0}, "positive distance"),
+            ({"threshold": float("nan")}, "positive distance"),
+            ({"threshold": {"cup": 1.0}}, r"\['cup'\], wanted.*\['ball', 'cup'\]"),
+        ],
+    )
+    def test_bad_input(self, changes, message):
+        states = changes.pop("states", [HELD])
+        with pytest.raises(ValueError, match=message):
+            true_influence(Table(), states, progress=False, **changes)
+
+    def test_unbounded_actions(self):
+        with pytest.raises(ValueError, match="finite"):
+            draw_actions([-np.inf], [1.0], 4)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return KitchenEnv()
+
+
+class TestKitchen:
+    """The real simulator; the threshold's reasons, measured."""
+
+    def test_out_of_reach_nothing_differs(self, env):
+        # The noise of the solver: the arm in its default posture touches nothing, so
+        # whatever differs between actions does so by noise alone.
+        rng = np.random.default_rng(0)
+        starts = np.stack([env.random_start("microwave", rng=rng) for _ in range(12)])
+        truth = true_influence(env, starts, num_actions=6, progress=False)
+        assert truth.influenced[:, 0].all()
+        assert not truth.influenced[:, 1:].any()
+        assert truth.displacement[:, 1:].max() < 1e-8
+        assert truth.displacement[:, 0].min() > 0.05
+
+    def test_own_motion_is_no_influence(self, env):
+        # A door that swings: far moved, but the same under every action.
+        velocity = np.zeros(29)
+        velocity[22] = -3.0
+        state = np.concatenate((env.default_state(), velocity))
+        after = env.outcomes(state, np.zeros((1, 9)))
+        assert abs(after[0, 22] - state[22]) > 0.02
+        truth = true_influence(env, state[None], num_actions=4, progress=False)
+        assert not truth.influenced[0, 1:].any()
+
+    def test_contact_is_seen(self, env):
+        # The kettle against the hand.
+        state = env.default_state()
+        hand = env.data
+        env.reset(seed=0, options={"start": state})
+        state[23:26] = hand.site("end_effector").xpos
+        truth = true_influence(env, state[None], num_actions=6, progress=False)
+        kettle = env.layout.index("kettle")
+        assert truth.influenced[0, kettle]
+        assert truth.displacement[0, kettle] > 10 * 2e-3
+        others = [i for i in range(1, 10) if i != kettle]
+        assert not truth.influenced[0, others].any()
+
+    def test_processes_change_nothing(self, env):
+        rng = np.random.default_rng(1)
+        starts = np.stack([env.random_start("kettle", rng=rng) for _ in range(9)])
+        velocity = rng.normal(0, 0.5, (9, 29))
+        velocity[:, 9:] = 0
+        states = np.concatenate((starts, velocity), axis=1)
+        alone = true_influence(env, states, num_actions=3, progress=False)
+        shared = true_influence(
+            KitchenEnv, states, num_actions=3, num_workers=1, progress=False
+        )
+        assert torch.equal(alone.influenced, shared.influenced)
+        assert torch.equal(alone.displacement, shared.displacement)
+        backwards = true_influence(
+            env, states[::-1].copy(), num_actions=3, progress=False
+        )
+        assert torch.equal(backwards.displacement.flip(0), alone.displacement)
+
+    def test_snapshots(self, env):
+        env.reset(seed=0)
+        env.step(np.ones(9))
+        truth = true_influence(env, [env.get_state()], num_actions=3, progress=False)
+        assert truth.influenced[0].tolist() == [True] + [False] * 9
+
+    def test_wrong_state_width(self, env):
+        with pytest.raises(ValueError, match=r"state has shape \(31,\)"):
+            true_influence(env, np.zeros((1, 31)), progress=False)
+
+
+scores = st.lists(
+    st.tuples(st.sampled_from([-1.0, 0.0, 0.25, 0.5, 3.0]), st.booleans()),
+    min_size=1,
+    max_size=30,
+)
+
+
+def slow_auc(score, truth):
+    wins = [
+        1.0 if a > b else 0.5 if a == b else 0.0
+        for a, up in zip(score, truth, strict=True)
+        if up
+        for b, down in zip(score, truth, strict=True)
+        if not down
+    ]
+    return sum(wins) / len(wins) if wins else math.nan
+
+
+def balanced_accuracy(score, truth, threshold):
+    hits = [a > threshold for a, t in zip(score, truth, strict=True) if t]
+    passes = [a <= threshold for a, t in zip(score, truth, strict=True) if not t]
+    return (sum(hits) / len(hits) + sum(passes) / len(passes)) / 2
+
+
+class TestScores:
+    @settings(max_examples=100, deadline=None)
+    @given(scores)
+    def test_auc_counts_pairs(self, rows):
+        score, truth = (np.array(x) for x in zip(*rows, strict=True))
+        assert roc_auc(score, truth) == pytest.approx(
+            slow_auc(score, truth), nan_ok=True
+        )
+
+    @settings(max_examples=100, deadline=None)
+    @given(scores)
+    def test_no_threshold_is_better(self, rows):
+        score, truth = (np.array(x) for x in zip(*rows, strict=True))
+        threshold, accuracy = best_threshold(score, truth)
+        if truth.all() or not truth.any():
+            assert math.isnan(threshold) and math.isnan(accuracy)
+            return
+        assert math.isfinite(threshold)
+        assert accuracy == pytest.approx(balanced_accuracy(score, truth, threshold))
+        for other in (-2.0, *score, *(score + 0.1)):
+            assert balanced_accuracy(score, truth, other) <= accuracy + 1e-12
+
+    def test_threshold_in_the_widest_gap(self):
+        score, truth = [0.0, 0.1, 0.9, 1.0], np.array([False, False, True, True])
+        assert best_threshold(score, truth) == (0.5, 1.0)
+        assert best_threshold([0.5, 0.5], np.array([True, False])) == (0.5, 0.5)
+
+    def test_tensors(self):
+        score, truth = torch.tensor([0.1, 0.9]), torch.tensor([False, True])
+        assert roc_auc(score, truth) == 1.0
+
+    def test_report(self):
+        truth = torch.tensor(
+            [[True, True, False], [True, False, False], [True, True, False]]
+        )
+        values = torch.tensor([[9.0, 0.9, 0.1], [9.0, 0.5, 0.4], [9.0, 0.2, 0.1]])
+        report = influence_report(values, truth, ["robot", "cup", "ball"], 0.3)
+        assert list(report) == ["robot", "cup", "ball"]
+        cup = report["cup"]
+        assert cup["auc"] == 0.5
+        assert cup["hit_rate"] == 0.5 and cup["false_alarms"] == 1.0
+        assert cup["influenced"] == pytest.approx(2 / 3)
+        assert cup["below_threshold"] == pytest.approx(1 / 3)
+        assert cup["best_balanced_accuracy"] == 0.75
+        assert math.isnan(report["ball"]["auc"])
+        assert math.isnan(report["ball"]["hit_rate"])
+        assert report["ball"]["false_alarms"] == pytest.approx(1 / 3)
+        assert math.isnan(report["robot"]["false_alarms"])
+
+    def test_bad_scores(self):
+        truth = np.array([True, False])
+        with pytest.raises(
+            ValueError, match=r"NaN \(not scored\) or infinite in 1 rows"
+        ):
+            roc_auc([np.nan, 1.0], truth)
+        with pytest.raises(ValueError, match="infinite in 1 rows"):
+            influence_report([[np.inf], [0.0]], truth[:, None], ["kettle"], 0.3)
+        with pytest.raises(ValueError, match="wanted the same"):
+            roc_auc([1.0], truth)
+        with pytest.raises(ValueError, match="wanted bool"):
+            best_threshold([1.0, 2.0], [1, 0])
+        with pytest.raises(ValueError, match="empty"):
+            best_threshold([], np.zeros(0, dtype=bool))
+        with pytest.raises(ValueError, match=r"\[S, 2\]"):
+            influence_report(np.zeros((2, 3)), np.zeros((2, 3), bool), ["a", "b"], 0.3)
+
+    def test_oracle(self):
+        mask = torch.tensor([[True, False]])
+        assert torch.equal(oracle_score(mask) > 0.3, mask)
+        assert oracle_score(mask).dtype == torch.float32
+        with pytest.raises(ValueError, match=r"torch\.bool"):
+            oracle_score(torch.ones(2, 3))

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from torchrl_caiac import plotting
+from torchrl_caiac.plotting import (
+    bootstrap_interval,
+    plot_frames,
+    plot_influence,
+    plot_success,
+)
+
+NAMES = ["robot", "kettle", "microwave", "slide_cabinet", "light_switch"]
+
+
+@pytest.fixture
+def scores() -> np.ndarray:
+    values = np.abs(np.random.default_rng(0).normal(0, 0.01, (60, 5)))
+    values[:, 0] = 5.0
+    values[20:30, 2] = 1.2
+    return values
+
+
+def legend(figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+class TestInfluence:
+    def test_highlights_what_passes_the_threshold(self, scores, tmp_path):
+        figure = plot_influence(scores, NAMES, threshold=0.3, exclude=["robot"])
+        assert legend(figure) == ["microwave", "3 others", "θ = 0.3"]
+        path = tmp_path / "influence.png"
+        figure.savefig(path)
+        assert path.stat().st_size > 5000
+
+    def test_true_contacts(self, scores):
+        truth = np.zeros(scores.shape, dtype=bool)
+        truth[22:28, 2] = True
+        truth[40:44, 1] = truth[50:52, 1] = True  # contact without a score
+        figure = plot_influence(
+            scores, NAMES, truth=truth, threshold=0.3, exclude=["robot"], title="x"
+        )
+        assert legend(figure)[:2] == ["kettle", "microwave"]
+        strip = figure.axes[1]
+        assert [t.get_text() for t in strip.get_yticklabels()] == [
+            "kettle",
+            "microwave",
+        ]
+        spans = [
+            path.get_extents().intervalx.tolist()
+            for bars in strip.collections
+            for path in bars.get_paths()
+        ]
+        assert spans == [[39.5, 43.5], [49.5, 51.5], [21.5, 27.5]]
+
+    def test_without_threshold_and_in_seconds(self, scores):
+        figure = plot_influence(scores, NAMES, exclude=["robot"], step_seconds=0.08)
+        assert legend(figure) == ["microwave", "3 others"]
+        assert figure.axes[0].get_xlabel() == "time (s)"
+        assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(59 * 0.08)
+
+    def test_gaps_one_row_and_many_entities(self, scores):
+        scores[3:6] = np.nan
+        plot_influence(scores, NAMES, threshold=0.3)
+        plot_influence(scores[:1], NAMES, truth=np.ones((1, 5), bool))
+        plot_influence(np.full((4, 5), np.nan), NAMES)
+        figure = plot_influence(np.ones((4, 12)), [f"e{i}" for i in range(12)])
+        looks = [(x.get_color(), x.get_linestyle()) for x in figure.axes[0].lines]
+        assert len(set(looks)) == 12
+
+    def test_input_stays(self, scores):
+        before = scores.copy()
+        plot_influence(scores, NAMES)
+        assert np.array_equal(scores, before)
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"names": NAMES[:3]}, r"\[L, 3\]"),
+            ({"scores": np.zeros((0, 5))}, "a row at least"),
+            ({"truth": np.zeros((60, 5))}, "wanted bool"),
+            ({"truth": np.zeros((6, 5), bool)}, r"\(60, 5\)"),
+            ({"exclude": ["toaster"]}, "toaster"),
+            ({"exclude": NAMES}, "no entity"),
+        ],
+    )
+    def test_bad_input(self, scores, changes, message):
+        arguments = {"scores": scores, "names": NAMES, **changes}
+        with pytest.raises(ValueError, match=message):
+            plot_influence(**arguments)
+
+
+RESULTS = {
+    "none": {"kettle": [1.0, 0.9, 1.0], "microwave": [0.0, 0.0, 0.0]},
+    "caiac": {"kettle": [1.0, 1.0, 1.0], "microwave": [0.8, 1.0, 0.9]},
+}
+
+
+class TestSuccess:
+    def test_bars_are_means(self, tmp_path):
+        figure = plot_success(RESULTS, labels={"caiac": "CAIAC"}, title="x")
+        axes = figure.axes[0]
+        heights = [[bar.get_height() for bar in c] for c in axes.containers[::2]]
+        assert np.allclose(heights, [[29 / 30, 0.0], [1.0, 0.9]])
+        assert [t.get_text() for t in axes.get_xticklabels()] == ["kettle", "microwave"]
+        assert legend(figure) == ["none", "CAIAC"]
+        figure.savefig(tmp_path / "success.png")
+
+    def test_intervals(self):
+        assert bootstrap_interval([0.5]) == (0.5, 0.5)
+        low, high = bootstrap_interval([0.0, 0.5, 1.0, 1.0])
+        assert 0 <= low < 0.625 < high <= 1
+        narrow = bootstrap_interval([0.0, 0.5, 1.0, 1.0], confidence=0.5)
+        assert low < narrow[0] < narrow[1] < high
+        assert bootstrap_interval([0.0, 0.5, 1.0, 1.0]) == (low, high)
+        # a normal mean's interval, from many runs
+        values = np.random.default_rng(0).normal(0, 1, 2000)
+        low, high = bootstrap_interval(values)
+        half = 1.96 * values.std() / 2000**0.5
+        assert low == pytest.approx(values.mean() - half, abs=0.005)
+        assert high == pytest.approx(values.mean() + half, abs=0.005)
+
+    def test_bad_input(self):
+        with pytest.raises(ValueError, match="empty"):
+            plot_success({})
+        with pytest.raises(ValueError, match=r"'b' lack the tasks \['kettle'\]"):
+            plot_success({"a": {"kettle": [1.0]}, "b": {}})
+        with pytest.raises(ValueError, match="at least one value"):
+            plot_success({"a": {"kettle": []}})
+        with pytest.raises(ValueError, match="finite"):
+            bootstrap_interval([0.0, np.nan])
+        with pytest.raises(ValueError, match="confidence"):
+            bootstrap_interval([0.0], confidence=95)
+
+
+class TestFrames:
+    def test_strip(self, tmp_path):
+        frames = np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), np.uint8)
+        figure = plot_frames(frames, [f"t = {i}" for i in range(5)], title="x")
+        assert len(figure.axes) == 5
+        assert np.array_equal(figure.axes[2].images[0].get_array(), frames[2])
+        figure.savefig(tmp_path / "frames.png")
+        lines = plot_frames(list(frames), columns=2)
+        spec = lines.axes[0].get_subplotspec().get_gridspec()
+        assert (spec.nrows, spec.ncols) == (3, 2)
+
+    def test_bad_input(self):
+        frame = np.zeros((4, 4, 3))
+        with pytest.raises(ValueError, match="empty"):
+            plot_frames([])
+        with pytest.raises(ValueError, match=r"frame 1 has shape \(4, 4\)"):
+            plot_frames([frame, frame[..., 0]])
+        with pytest.raises(ValueError, match="1 titles for 2 frames"):
+            plot_frames([frame, frame], ["a"])
+        with pytest.raises(ValueError, match="columns"):
+            plot_frames([frame], columns=0)
+
+
+def test_matplotlib_waits_until_it_is_needed():
+    # The file alone: the package around it imports torch, which takes seconds.
+    code = (
+        "import runpy, sys; "
+        f"names = runpy.run_path({plotting.__file__!r}); "
+        "assert 'matplotlib' not in sys.modules and 'scipy' not in sys.modules; "
+        "import numpy as np; "
+        "names['plot_frames'](np.zeros((1, 4, 4, 3))); "
+        "assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=240)
