@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import pickle
 
 import gymnasium
@@ -15,7 +16,7 @@ from gymnasium_robotics.envs.franka_kitchen.kitchen_env import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchrl.envs import check_env_specs
+from torchrl.envs import SerialEnv, check_env_specs
 
 from torchrl_caiac.envs.kitchen import (
     KITCHEN_ENV_ID,
@@ -539,6 +540,13 @@ class TestLibraries:
         assert rollout["next", "truncated"].flatten().tolist() == [False] * 3 + [True]
         assert not rollout["next", "terminated"].any()
         assert abs(rollout["observation"][0, 19] - 0.37) < 1e-3
+        env.close()
+
+    def test_torchrl_batched(self):
+        env = SerialEnv(2, functools.partial(make_kitchen_env, "kettle"))
+        rollout = env.rollout(3)
+        assert rollout["next", "wrong_tasks"].shape == (2, 3, 7)
+        assert rollout["is_init"][..., 0].tolist() == [[True, False, False]] * 2
         env.close()
 
     def test_torchrl_reports_success(self):

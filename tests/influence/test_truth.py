@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.envs.kitchen import KitchenEnv
+from torchrl_caiac.envs.kitchen_expert import KitchenExpert
 from torchrl_caiac.influence.truth import (
     best_threshold,
     draw_actions,
@@ -154,6 +155,26 @@ class TestKitchen:
         assert truth.displacement[0, kettle] > 10 * 2e-3
         others = [i for i in range(1, 10) if i != kettle]
         assert not truth.influenced[0, others].any()
+
+    def test_contact_is_not_subtle(self):
+        # Along a demonstration: nothing at first, then the kettle, never another
+        # object; and a threshold far from 2 mm gives the same answer.
+        env = KitchenEnv("kettle", terminate_on_success=False)
+        expert = KitchenExpert(env, "kettle", rng=0)
+        env.reset(seed=0)
+        expert.reset()
+        states = []
+        for _ in range(17):
+            states.append(np.concatenate((env.qpos, env.qvel)))
+            env.step(expert())
+        truth = true_influence(env, states[::2], num_actions=8, progress=False)
+        kettle = env.layout.index("kettle")
+        contacts = truth.influenced[:, kettle]
+        assert not contacts[0] and contacts[-3:].any()
+        others = [i for i in range(1, 10) if i != kettle]
+        assert truth.displacement[:, others].max() < 1e-8
+        for threshold in (3e-4, 1e-3, 4e-3):
+            assert torch.equal(truth.displacement[:, kettle] > threshold, contacts)
 
     def test_processes_change_nothing(self, env):
         rng = np.random.default_rng(1)

@@ -360,8 +360,8 @@ def kitchen_transitions(
 
     if path is not None and Path(path).exists() and not overwrite:
         raise FileExistsError(
-            f"{path} exists; pass overwrite=True to replace it, or load it with "
-            "TensorDict.load_memmap"
+            f"{path} exists; pass overwrite=True to replace it, or open it with "
+            "load_transitions"
         )
     if isinstance(dataset, str):
         dataset = load_kitchen_dataset(dataset, root)

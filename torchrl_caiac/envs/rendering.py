@@ -133,8 +133,12 @@ def _gl_context(width: int, height: int) -> Any:
     reasons = [] if backends else [f"MUJOCO_GL is {asked!r}"]
     for backend in backends:
         try:
-            module = importlib.import_module(f"mujoco.{backend}")
-            return module.GLContext(width, height)
+            kind = importlib.import_module(f"mujoco.{backend}").GLContext
+            context = kind.__new__(kind)
+            # Its __del__ reads this, also where __init__ failed before writing it.
+            context._context = None
+            context.__init__(width, height)
+            return context
         # What a missing driver raises differs by its loader: ImportError,
         # AttributeError, RuntimeError, OpenGL's own errors.
         except Exception as error:

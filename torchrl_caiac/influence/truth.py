@@ -131,12 +131,14 @@ def true_influence(
     eq. 3 approximate. What an entity does on its own (a kettle that slides on after a
     push) is the same under every action and does not count.
 
-    Why 2 mm (or mrad): entities out of the robot's reach differ by less than 1e-8
-    between actions in the kitchen (measured by the tests, from random starts), so no
-    threshold above that confuses the solver's noise with contact. Below a few
-    millimetres lie grazing contacts, which nobody can use: the observation noise of an
-    object is up to 0.05 mm, a task needs 0.3, and the world models take differences
-    below their floor of 2 mm for noise.
+    Why 2 mm (or mrad): the solver adds no noise to tell from contact (entities that the
+    robot does not touch differ by less than 1e-8 between actions), and contact is not
+    subtle. In the states of scripted microwave and kettle demonstrations, 146 of the
+    147 displacements above 1e-8 are above 2 mm and every threshold from 0.3 to 4 mm
+    gives the same masks. Below that, nobody could use the difference: the observation
+    noise of an object is up to 0.05 mm, a task needs 0.3, and the world models take
+    differences under their floor of 2 mm for noise. The tests measure both. Sixteen
+    actions miss 3 of 48 contacts that 48 actions find there: grazing ones.
 
     Args:
         env: a simulator, or a picklable function without arguments that makes one (the
