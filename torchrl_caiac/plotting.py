@@ -194,7 +194,9 @@ def plot_influence(
     quiet = [i for i in kept if i not in loud]
     for n, i in enumerate(quiet):
         label = (
-            f"{len(quiet)} others" if n == 0 and len(quiet) > 1 else _label(names[i])
+            f"{len(quiet)} {'others' if loud else 'entities'}"
+            if n == 0 and len(quiet) > 1
+            else _label(names[i])
         )
         axes.plot(
             time,
@@ -214,7 +216,7 @@ def plot_influence(
             zorder=2,
         )
     _plain(axes)
-    axes.set_ylabel("influence score (nats)")
+    axes.set_ylabel("influence score")
     axes.set_xlim(time[0], max(time[-1], pitch))
     axes.set_ylim(min(0.0, float(drawn.min())), 1.05 * top if top > 0 else 1.0)
     figure.legend(loc="outside right upper", frameon=False, fontsize=9)

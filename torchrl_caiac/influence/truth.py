@@ -138,7 +138,7 @@ def true_influence(
     gives the same masks. Below that, nobody could use the difference: the observation
     noise of an object is up to 0.05 mm, a task needs 0.3, and the world models take
     differences under their floor of 2 mm for noise. The tests measure both. Sixteen
-    actions miss 3 of 48 contacts that 48 actions find there: grazing ones.
+    actions miss 3 of 27 contacts that 48 actions find in every sixth of these states.
 
     Args:
         env: a simulator, or a picklable function without arguments that makes one (the
