@@ -761,7 +761,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         """Put the simulator into a recorded state, within the present episode.
 
         Unlike a snapshot, positions and velocities do not hold the solver's warm
-        start: what follows agrees with the recording to about 1e-5, not exactly.
+        start: what follows agrees with the recording closely, not exactly.
 
         Args:
             qpos: positions ``[30]``.

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import Bounded
 
+from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.gaussian_world_model import (
     GaussianWorldModel,
     evaluating,
@@ -270,6 +271,11 @@ class CAI(nn.Module):
         self.register_buffer("actions", draw_actions(num_actions, low, high, generator))
         self.actions = self.actions.to(model.loc_head.weight.device)
 
+    @property
+    def layout(self) -> EntityLayout:
+        """The entities that are scored: the model's."""
+        return self.model.layout
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> torch.Tensor:
         """The influence on every entity; without gradients, in evaluation mode.
@@ -284,7 +290,7 @@ class CAI(nn.Module):
         Raises:
             ValueError: an observation is not finite, or the model's output is not.
         """
-        state = self.model.layout.read(tensordict)
+        state = self.layout.read(tensordict)
         batch = state.shape[:-1]
         state = state.reshape(-1, state.shape[-1])
         scores = torch.empty(
