@@ -100,7 +100,6 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
     folder = run_folder(cfg, arm, seed)
     keep_settings(cfg, "train", folder)
     torch.manual_seed(seed)
-    torch.set_flush_denormal(True)
     data = load_transitions(Path(cfg.out) / "demonstrations")
     model = make_model(cfg)
     model.fit_statistics(data, goals=KitchenEnv.layout.achieved_goal(data, next=True))
@@ -131,29 +130,34 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
     )
     swapped = torch.zeros(())
     model.train()
-    while step < settings.steps:
-        batch = rb.sample()
-        losses = loss_module(batch.reshape(-1, settings.window))
-        loss = losses["loss_reconstruction"] + losses["loss_kl"]
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        scheduler.step()
-        step += 1
-        bar.update()
-        if arm != "none":
-            # Rows of a window share their flags.
-            any_swap = batch["caiac", "swapped"].any(-1)
-            swapped += any_swap.float().mean()
-        if step % settings.log_every == 0:
-            scalars = {key: value.item() for key, value in losses.items()}
-            scalars["share_swapped"] = swapped.item() / settings.log_every
-            swapped.zero_()
-            for key, value in scalars.items():
-                logger.log_scalar(key, value, step=step)
-            bar.set_postfix(loss=f"{loss.item():.3f}")
-        if step % settings.checkpoint_every == 0 or step == settings.steps:
-            checkpoint.save(folder / "checkpoint")
+    # Denormal numbers slow the LSTM's backward pass down; MuJoCo shall have them.
+    torch.set_flush_denormal(True)
+    try:
+        while step < settings.steps:
+            batch = rb.sample()
+            losses = loss_module(batch.reshape(-1, settings.window))
+            loss = losses["loss_reconstruction"] + losses["loss_kl"]
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            scheduler.step()
+            step += 1
+            bar.update()
+            if arm != "none":
+                # Rows of a window share their flags.
+                any_swap = batch["caiac", "swapped"].any(-1)
+                swapped += any_swap.float().mean()
+            if step % settings.log_every == 0:
+                scalars = {key: value.item() for key, value in losses.items()}
+                scalars["share_swapped"] = swapped.item() / settings.log_every
+                swapped.zero_()
+                for key, value in scalars.items():
+                    logger.log_scalar(key, value, step=step)
+                bar.set_postfix(loss=f"{loss.item():.3f}")
+            if step % settings.checkpoint_every == 0 or step == settings.steps:
+                checkpoint.save(folder / "checkpoint")
+    finally:
+        torch.set_flush_denormal(False)
     bar.close()
     return model.eval()
 
