@@ -16,7 +16,11 @@ import torch
 from omegaconf import DictConfig
 from settings import keep_settings
 from tensordict import TensorDictBase
-from torchrl.checkpoint import Checkpoint, GlobalRNGState
+from torchrl.checkpoint import (
+    Checkpoint,
+    GlobalRNGState,
+    StateDictCheckpointAdapter,
+)
 from torchrl.data import (
     ImmutableDatasetWriter,
     SliceSampler,
@@ -111,12 +115,26 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
     optimizer = torch.optim.Adam(model.parameters(), lr=settings.lr, fused=True)
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
     rb = make_buffer(data, cfg, arm)
-    checkpoint = Checkpoint(
-        model=model, optimizer=optimizer, scheduler=scheduler, rng=GlobalRNGState()
-    )
+    checkpoint = Checkpoint(format="archive")
+    for name, part in {
+        "model": model,
+        "optimizer": optimizer,
+        "scheduler": scheduler,
+        "rng": GlobalRNGState(),
+    }.items():
+        # As tensordicts the optimizer would get views of the file, and write into it.
+        adapter = StateDictCheckpointAdapter(payload_format="torch")
+        checkpoint.register(name, part, adapter=adapter)
+    path = folder / "checkpoint.zip"
     step = 0
-    if (folder / "checkpoint").exists():
-        checkpoint.load(folder / "checkpoint")
+    if path.exists():
+        try:
+            checkpoint.load(path)
+        except Exception as error:
+            raise ValueError(
+                f"{path} is no readable checkpoint of this training, it may be "
+                f"truncated or foreign ({error}): delete it to begin anew"
+            ) from error
         step = scheduler.last_epoch
         _LOGGER.info("%s goes on at step %d", folder.name, step)
     logger = get_logger(settings.logger, str(folder), "log")
@@ -155,7 +173,7 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
                     logger.log_scalar(key, value, step=step)
                 bar.set_postfix(loss=f"{loss.item():.3f}")
             if step % settings.checkpoint_every == 0 or step == settings.steps:
-                checkpoint.save(folder / "checkpoint")
+                checkpoint.save(path)
     finally:
         torch.set_flush_denormal(False)
     bar.close()

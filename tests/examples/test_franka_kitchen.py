@@ -128,6 +128,19 @@ def test_a_killed_training_ends_as_one_that_was_not(cfg, steps, monkeypatch):
         torch.testing.assert_close(resumed[key], value, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("content", [None, b"", b"PK foreign"])
+def test_a_truncated_checkpoint_is_refused(content, cfg, steps):
+    train = steps["train"]
+    train.train(cfg, "none", seed=7)
+    path = train.run_folder(cfg, "none", 7) / "checkpoint.zip"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    with pytest.raises(ValueError, match=r"checkpoint\.zip is no readable checkpoint"):
+        train.train(cfg, "none", seed=7)
+    path.write_bytes(whole)
+    train.train(cfg, "none", seed=7)
+
+
 def test_other_settings_are_not_mixed(cfg, steps):
     steps["train"].train(cfg, "none", seed=0)
     other = cfg.copy()
