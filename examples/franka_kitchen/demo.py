@@ -79,30 +79,30 @@ def draw_influence(cfg: DictConfig, path: Path) -> None:
 
 
 def draw_counterfactuals(cfg: DictConfig, path: Path) -> None:
-    """Fig. 1: a frame of a demonstration beside counterfactual frames made from it."""
+    """Fig. 1: a frame of a demonstration of each task beside a counterfactual of it."""
     data = load_transitions(Path(cfg.out) / "demonstrations")
     torch.manual_seed(0)
-    demonstration = (data["episode"] == data["episode"][data["task"] == 0][0]).nonzero()
-    row = demonstration[int(0.75 * len(demonstration))]
     copies = 64
-    rows = torch.cat([torch.randint(len(data), (512 - copies,)), row.expand(copies)])
     transform = CAIACTransform(
         KitchenEnv.layout,
         threshold=cfg.score.threshold,
-        counterfactual_ratio=copies / len(rows),
+        counterfactual_ratio=copies / 512,
     )
-    made = transform(data[rows])["observation"][-copies:]
-    # Of those made, the three that look most different from what is shown already.
-    states = data["observation"][row].clone()
-    for _ in range(3):
-        distance = torch.cdist(made, states).amin(1)
-        states = torch.cat([states, made[distance.argmax()][None]])
+    states, titles = [], []
+    for task in ("microwave", "kettle"):
+        own = data["episode"][data["task"] == KITCHEN_TASKS.index(task)]
+        demonstration = (data["episode"] == own[0]).nonzero()
+        row = demonstration[int(0.75 * len(demonstration))]
+        donors = torch.randint(len(data), (512 - copies,))
+        batch = transform(data[torch.cat([donors, row.expand(copies)])])
+        made, shown = batch["observation"][-copies:], data["observation"][row]
+        states += [shown[0], made[torch.cdist(made, shown).argmax()]]
+        titles += [f"{task}, demonstration", f"{task}, counterfactual"]
     kitchen = KitchenEnv(render_mode="rgb_array")
     try:
-        frames = kitchen.render_states(states.numpy())
+        frames = kitchen.render_states(torch.stack(states).numpy())
     finally:
         kitchen.close()
-    titles = ["demonstration", *[f"counterfactual {i}" for i in (1, 2, 3)]]
     plot_frames(frames, titles).savefig(path, dpi=150, bbox_inches="tight")
 
 
