@@ -74,7 +74,9 @@ def evaluate_task(
             finally:
                 kitchen.close()
             figure = plot_frames(frames, [f"step {int(i) + 1}" for i in shown])
-            figure.savefig(folder / f"{task}-{number}.png", dpi=150)
+            figure.savefig(
+                folder / f"{task}-{number}.png", dpi=150, bbox_inches="tight"
+            )
     return results
 
 
