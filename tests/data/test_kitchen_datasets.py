@@ -19,8 +19,8 @@ from torchrl_caiac.data.kitchen_datasets import (
     create_kitchen_demonstrations,
     create_kitchen_random,
     kitchen_transitions,
-    load_kitchen_dataset,
 )
+from torchrl_caiac.data.minari_files import open_minari
 from torchrl_caiac.envs.kitchen import KITCHEN_TASKS
 
 GROUPS = (
@@ -77,7 +77,7 @@ def test_minari_itself_finds_the_datasets(
     observation, _ = env.reset(seed=0)
     assert dataset.observation_space.contains(observation)
     env.close()
-    assert load_kitchen_dataset(RANDOM_ID).total_episodes == (
+    assert open_minari(RANDOM_ID).total_episodes == (
         random_actions.total_episodes
     )
 
@@ -235,7 +235,7 @@ def test_nothing_is_left_behind_by_an_error(demonstrations, root, monkeypatch):
 
 def test_bad_input(demonstrations, root, tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="no Minari dataset"):
-        load_kitchen_dataset("kitchen/none-v0", root)
+        open_minari("kitchen/none-v0", root)
     with pytest.raises(KeyError, match="toaster"):
         create_kitchen_demonstrations(
             demonstrations=[Demonstrations("toaster")], root=tmp_path

@@ -8,14 +8,11 @@ of them.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import logging
 import os
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +25,15 @@ from torchrl_caiac.data.collect import (
     load_episode,
     record_episode,
 )
-from torchrl_caiac.data.load_transitions import load_transitions
+from torchrl_caiac.data.minari_files import (
+    free_dataset_path,
+    index_tree,
+    open_minari,
+    publish_dataset,
+    stack_trees,
+    work_folder,
+    write_rows,
+)
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -45,7 +50,6 @@ __all__ = [
     "create_kitchen_demonstrations",
     "create_kitchen_random",
     "kitchen_transitions",
-    "load_kitchen_dataset",
 ]
 
 logger = logging.getLogger("torchrl_caiac.data.kitchen_datasets")
@@ -58,7 +62,6 @@ _TASKS = ("microwave", "kettle")
 _ENV_ID = "FrankaKitchen-v1"
 # Objects settle by up to 7 mm (or mrad) when an episode starts; more is a collision.
 _UNTOUCHED = 0.02
-_PARTIAL = ".partial-"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +138,7 @@ def create_kitchen_demonstrations(
     """
     from torchrl_caiac.envs.kitchen_expert import TASKS
 
-    target = _free_target(dataset_id, root, overwrite)
+    target = free_dataset_path(dataset_id, root, overwrite)
     specs: list[dict[str, Any]] = []
     for group in demonstrations:
         if group.task not in TASKS:
@@ -156,7 +159,7 @@ def create_kitchen_demonstrations(
     if not specs:
         raise ValueError("no demonstrations asked for: every group has 0 episodes")
     tasks = tuple(dict.fromkeys((*_TASKS, *(group.task for group in demonstrations))))
-    with _work_folder(work, dataset_id) as folder:
+    with work_folder(work, dataset_id) as folder:
         report = collect_episodes(
             _ExpertFactory(tasks),
             specs,
@@ -167,11 +170,12 @@ def create_kitchen_demonstrations(
             description="demonstrations",
         )
         buffers = [_demonstration_buffer(file) for file in report.files]
-    dataset = _publish(
+    dataset = publish_dataset(
         dataset_id,
         buffers,
         target,
-        tasks,
+        lambda: _make_env(tasks),
+        code="torchrl_caiac/data/kitchen_datasets.py",
         progress=progress,
         description=(
             "A scripted expert's demonstrations of single kitchen tasks: "
@@ -240,9 +244,9 @@ def create_kitchen_random(
         raise ValueError(
             f"steps is {steps} and starts_per_file {starts_per_file}, wanted at least 1"
         )
-    target = _free_target(dataset_id, root, overwrite)
+    target = free_dataset_path(dataset_id, root, overwrite)
     if isinstance(demonstrations, str):
-        demonstrations = load_kitchen_dataset(demonstrations, root)
+        demonstrations = open_minari(demonstrations, root)
     states = _simulator_states(demonstrations)
     total = max(round(ratio * int(demonstrations.total_steps) / steps), 1)
     rng = np.random.default_rng([seed, 1])
@@ -257,7 +261,7 @@ def create_kitchen_random(
         }
         for first in range(0, total, starts_per_file)
     ]
-    with _work_folder(work, dataset_id) as folder:
+    with work_folder(work, dataset_id) as folder:
         folder.mkdir(parents=True, exist_ok=True)
         stored = folder / "states.npy"
         if not (stored.exists() and _same_array(stored, states)):
@@ -277,11 +281,12 @@ def create_kitchen_random(
             description=f"random actions, {starts_per_file} x {steps}",
         )
         buffers = [buffer for file in report.files for buffer in _random_buffers(file)]
-    return _publish(
+    return publish_dataset(
         dataset_id,
         buffers,
         target,
-        _TASKS,
+        lambda: _make_env(_TASKS),
+        code="torchrl_caiac/data/kitchen_datasets.py",
         progress=progress,
         description=(
             f"{steps} uniformly random actions from each of {total} states of "
@@ -289,33 +294,6 @@ def create_kitchen_random(
         ),
         algorithm_name="uniform random actions",
     )
-
-
-def load_kitchen_dataset(
-    dataset_id: str, root: str | os.PathLike[str] | None = None
-) -> MinariDataset:
-    """Open a local Minari dataset.
-
-    Args:
-        dataset_id: Minari's name of the dataset.
-        root: folder of Minari datasets; `MINARI_DATASETS_PATH` or Minari's own where
-            None.
-
-    Returns:
-        the dataset.
-
-    Raises:
-        FileNotFoundError: there is none of that name.
-    """
-    from minari import MinariDataset
-
-    data = _dataset_path(dataset_id, root) / "data"
-    if not data.exists():
-        raise FileNotFoundError(
-            f"no Minari dataset {dataset_id!r} at {data.parent}; collect it first, or "
-            "say where it is with root= or MINARI_DATASETS_PATH"
-        )
-    return MinariDataset(data)
 
 
 def kitchen_transitions(
@@ -364,7 +342,7 @@ def kitchen_transitions(
             "load_transitions"
         )
     if isinstance(dataset, str):
-        dataset = load_kitchen_dataset(dataset, root)
+        dataset = open_minari(dataset, root)
     columns = list(STATE_COLUMNS)
     indices = dataset.episode_indices
     metadata = dataset.storage.get_episode_metadata(indices)
@@ -431,21 +409,7 @@ def kitchen_transitions(
     if all(len(values) == len(lengths) for values in simulator.values()):
         for name, values in simulator.items():
             rows["sim", name] = joined(values, torch.float64)
-    return rows if path is None else _memmap(rows, Path(path))
-
-
-def _memmap(rows: TensorDict, path: Path) -> TensorDict:
-    """Write rows beside their place and move them there when they are whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
-    try:
-        rows.memmap(partial / "rows")
-        if path.exists():
-            os.replace(path, partial / "replaced")
-        os.replace(partial / "rows", path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return load_transitions(path)
+    return rows if path is None else write_rows(rows, path)
 
 
 # Sources of episodes. They live in worker processes, made there by their factories.
@@ -562,26 +526,10 @@ class _RandomSource:
                     else None,
                 )
             )
-        return _stack_trees(episodes)
+        return stack_trees(episodes)
 
     def close(self) -> None:
         self.env.close()
-
-
-def _stack_trees(trees: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    return {
-        key: _stack_trees([tree[key] for tree in trees])
-        if isinstance(value, Mapping)
-        else np.stack([tree[key] for tree in trees])
-        for key, value in trees[0].items()
-    }
-
-
-def _index_tree(tree: Mapping[str, Any], index: int) -> dict[str, Any]:
-    return {
-        key: _index_tree(value, index) if isinstance(value, Mapping) else value[index]
-        for key, value in tree.items()
-    }
 
 
 # Minari.
@@ -601,7 +549,7 @@ def _random_buffers(file: Path) -> Iterator[EpisodeBuffer]:
 
     arrays, _ = load_episode(file)
     for index in range(len(arrays["actions"])):
-        yield EpisodeBuffer(**_index_tree(arrays, index))
+        yield EpisodeBuffer(**index_tree(arrays, index))
 
 
 def _simulator_states(dataset: MinariDataset) -> NDArray[np.float64]:
@@ -626,91 +574,3 @@ def _same_array(file: Path, array: NDArray[Any]) -> bool:
         return np.array_equal(np.load(file, allow_pickle=False), array)
     except (OSError, ValueError, EOFError):
         return False
-
-
-def _dataset_path(dataset_id: str, root: str | os.PathLike[str] | None) -> Path:
-    if root is not None:
-        # Minari loses its way from a relative one.
-        return Path(root).absolute() / dataset_id
-    from minari.storage import get_dataset_path
-
-    return Path(get_dataset_path(dataset_id)).absolute()
-
-
-def _free_target(
-    dataset_id: str, root: str | os.PathLike[str] | None, overwrite: bool
-) -> Path:
-    target = _dataset_path(dataset_id, root)
-    if target.exists() and not overwrite:
-        raise FileExistsError(
-            f"there is a dataset {dataset_id!r} at {target}; pass overwrite=True to "
-            "replace it"
-        )
-    return target
-
-
-@contextlib.contextmanager
-def _work_folder(
-    work: str | os.PathLike[str] | None, dataset_id: str
-) -> Iterator[Path]:
-    if work is not None:
-        yield Path(work) / dataset_id.replace("/", "-")
-        return
-    with tempfile.TemporaryDirectory(prefix="kitchen-") as folder:
-        yield Path(folder)
-
-
-def _publish(
-    dataset_id: str,
-    buffers: Iterable[EpisodeBuffer],
-    target: Path,
-    tasks: Sequence[str],
-    *,
-    progress: bool,
-    description: str,
-    algorithm_name: str,
-) -> MinariDataset:
-    """Write a dataset beside its place and move it there when it is whole."""
-    import minari
-    from minari import MinariDataset
-    from tqdm import tqdm
-
-    place = target
-    for _ in Path(dataset_id).parts:
-        place = place.parent
-    place.mkdir(parents=True, exist_ok=True)
-    env = _make_env(tasks)
-    partial = Path(tempfile.mkdtemp(dir=place, prefix=_PARTIAL))
-    previous = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(partial)
-    try:
-        bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
-        minari.create_dataset_from_buffers(
-            dataset_id,
-            bar,
-            env=env,
-            eval_env=env,
-            algorithm_name=algorithm_name,
-            author="torchrl-caiac",
-            author_email="none",
-            code_permalink="torchrl_caiac/data/kitchen_datasets.py",
-            description=description,
-            requirements=["gymnasium-robotics>=1.4,<1.5", "mujoco>=3.1,<3.12"],
-        )
-        built = partial / dataset_id
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # Minari describes a namespace in a file of its own.
-        for extra in built.parent.iterdir():
-            if extra.is_file() and not (target.parent / extra.name).exists():
-                os.replace(extra, target.parent / extra.name)
-        if target.exists():
-            os.replace(target, partial / "replaced")
-        os.replace(built, target)
-    finally:
-        if previous is None:
-            del os.environ["MINARI_DATASETS_PATH"]
-        else:
-            os.environ["MINARI_DATASETS_PATH"] = previous
-        shutil.rmtree(partial, ignore_errors=True)
-        env.close()
-    return MinariDataset(target / "data")

@@ -1,0 +1,267 @@
+"""Local Minari datasets: where they lie, and how they are written whole or not at all.
+
+What the makers of datasets share: :mod:`~torchrl_caiac.data.kitchen_datasets` and
+:mod:`~torchrl_caiac.data.fetch_push_datasets`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchrl_caiac.data.load_transitions import load_transitions
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+    from minari.data_collector import EpisodeBuffer
+    from tensordict import TensorDict
+
+__all__ = [
+    "dataset_path",
+    "free_dataset_path",
+    "index_tree",
+    "open_minari",
+    "publish_dataset",
+    "stack_trees",
+    "work_folder",
+    "write_rows",
+]
+
+_PARTIAL = ".partial-"
+
+
+def dataset_path(dataset_id: str, root: str | os.PathLike[str] | None = None) -> Path:
+    """Return the folder of a Minari dataset.
+
+    Args:
+        dataset_id: Minari's name of the dataset.
+        root: folder of Minari datasets; `MINARI_DATASETS_PATH` or Minari's own where
+            None.
+
+    Returns:
+        the folder, which need not exist.
+
+    Example:
+        >>> dataset_path("kitchen/play-v0", "/data").as_posix()
+        '/data/kitchen/play-v0'
+    """
+    if root is not None:
+        # Minari loses its way from a relative one.
+        return Path(root).absolute() / dataset_id
+    from minari.storage import get_dataset_path
+
+    return Path(get_dataset_path(dataset_id)).absolute()
+
+
+def free_dataset_path(
+    dataset_id: str, root: str | os.PathLike[str] | None, overwrite: bool
+) -> Path:
+    """Return the folder of a dataset that is to be written.
+
+    Args:
+        dataset_id: Minari's name of the dataset.
+        root: see :func:`dataset_path`.
+        overwrite: whether there may be one already.
+
+    Returns:
+        the folder.
+
+    Raises:
+        FileExistsError: there is a dataset of that name and `overwrite` is False.
+    """
+    target = dataset_path(dataset_id, root)
+    if target.exists() and not overwrite:
+        raise FileExistsError(
+            f"there is a dataset {dataset_id!r} at {target}; pass overwrite=True to "
+            "replace it"
+        )
+    return target
+
+
+def open_minari(
+    dataset_id: str, root: str | os.PathLike[str] | None = None
+) -> MinariDataset:
+    """Open a local Minari dataset.
+
+    Args:
+        dataset_id: Minari's name of the dataset.
+        root: see :func:`dataset_path`.
+
+    Returns:
+        the dataset.
+
+    Raises:
+        FileNotFoundError: there is none of that name.
+    """
+    from minari import MinariDataset
+
+    data = dataset_path(dataset_id, root) / "data"
+    if not data.exists():
+        raise FileNotFoundError(
+            f"no Minari dataset {dataset_id!r} at {data.parent}; collect it first, or "
+            "say where it is with root= or MINARI_DATASETS_PATH"
+        )
+    return MinariDataset(data)
+
+
+@contextlib.contextmanager
+def work_folder(work: str | os.PathLike[str] | None, dataset_id: str) -> Iterator[Path]:
+    """Give a folder for the episodes of a collection, temporary where None is named.
+
+    Args:
+        work: where several collections keep theirs.
+        dataset_id: Minari's name of the dataset that is collected.
+
+    Yields:
+        the collection's own folder.
+    """
+    if work is not None:
+        yield Path(work) / dataset_id.replace("/", "-")
+        return
+    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
+        yield Path(folder)
+
+
+def publish_dataset(
+    dataset_id: str,
+    buffers: Iterable[EpisodeBuffer],
+    target: Path,
+    make_env: Callable[[], Any],
+    *,
+    code: str,
+    progress: bool,
+    description: str,
+    algorithm_name: str,
+) -> MinariDataset:
+    """Write a dataset beside its place and move it there when it is whole.
+
+    Args:
+        dataset_id: Minari's name of the dataset.
+        buffers: the episodes.
+        target: of :func:`free_dataset_path`; what is there is replaced.
+        make_env: makes the environment that Minari keeps the specification of.
+
+    Keyword Args:
+        code: the file that collected it.
+        progress: show a progress bar.
+        description: what the dataset holds.
+        algorithm_name: what acted.
+
+    Returns:
+        the dataset.
+    """
+    import minari
+    from minari import MinariDataset
+    from tqdm import tqdm
+
+    place = target
+    for _ in Path(dataset_id).parts:
+        place = place.parent
+    place.mkdir(parents=True, exist_ok=True)
+    env = make_env()
+    partial = Path(tempfile.mkdtemp(dir=place, prefix=_PARTIAL))
+    previous = os.environ.get("MINARI_DATASETS_PATH")
+    os.environ["MINARI_DATASETS_PATH"] = str(partial)
+    try:
+        bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
+        minari.create_dataset_from_buffers(
+            dataset_id,
+            bar,
+            env=env,
+            eval_env=env,
+            algorithm_name=algorithm_name,
+            author="torchrl-caiac",
+            author_email="none",
+            code_permalink=code,
+            description=description,
+            requirements=["gymnasium-robotics>=1.4,<1.5", "mujoco>=3.1,<3.12"],
+        )
+        built = partial / dataset_id
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # Minari describes a namespace in a file of its own.
+        for extra in built.parent.iterdir():
+            if extra.is_file() and not (target.parent / extra.name).exists():
+                os.replace(extra, target.parent / extra.name)
+        if target.exists():
+            os.replace(target, partial / "replaced")
+        os.replace(built, target)
+    finally:
+        if previous is None:
+            del os.environ["MINARI_DATASETS_PATH"]
+        else:
+            os.environ["MINARI_DATASETS_PATH"] = previous
+        shutil.rmtree(partial, ignore_errors=True)
+        env.close()
+    return MinariDataset(target / "data")
+
+
+def write_rows(rows: TensorDict, path: str | os.PathLike[str]) -> TensorDict:
+    """Write rows to a folder, which appears whole or not at all, and open them.
+
+    Args:
+        rows: transitions `[T]`.
+        path: the folder; what is there is replaced.
+
+    Returns:
+        the memory-mapped rows.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
+    try:
+        rows.memmap(partial / "rows")
+        if path.exists():
+            os.replace(path, partial / "replaced")
+        os.replace(partial / "rows", path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return load_transitions(path)
+
+
+def stack_trees(trees: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Stack nested arrays of equal structure, `[*]` each, to `[M, *]`.
+
+    Args:
+        trees: `M` mappings of names to arrays or mappings.
+
+    Returns:
+        one such mapping.
+
+    Example:
+        >>> stack_trees([{"a": 1}, {"a": 2}])
+        {'a': array([1, 2])}
+    """
+    return {
+        key: stack_trees([tree[key] for tree in trees])
+        if isinstance(value, Mapping)
+        else np.stack([tree[key] for tree in trees])
+        for key, value in trees[0].items()
+    }
+
+
+def index_tree(tree: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """Return the entry of nested arrays at an index, what :func:`stack_trees` undid.
+
+    Args:
+        tree: mapping of names to arrays `[M, *]` or mappings.
+        index: which of the `M`.
+
+    Returns:
+        the same mapping with arrays `[*]`.
+
+    Example:
+        >>> import numpy as np
+        >>> index_tree({"a": np.array([1, 2])}, 1)["a"].item()
+        2
+    """
+    return {
+        key: index_tree(value, index) if isinstance(value, Mapping) else value[index]
+        for key, value in tree.items()
+    }
