@@ -36,6 +36,16 @@ def goal_env(rng: np.random.Generator, length: int) -> dict:
     }
 
 
+def foreign_goals(rng: np.random.Generator, length: int) -> dict:
+    """A goal environment without achieved goals, with entries of its own."""
+    return {
+        "observation": arrays(rng, length + 1, 5),
+        "desired_goal": arrays(rng, length + 1, 2),
+        "camera": rng.integers(0, 256, (length + 1, 4, 4, 1), dtype=np.uint8),
+        "phase": rng.integers(0, 3, length + 1),
+    }
+
+
 def parts(rng: np.random.Generator, length: int) -> dict:
     return {"arm": arrays(rng, length + 1, 2), "cup": arrays(rng, length + 1, 1)}
 
@@ -47,7 +57,23 @@ def taken(rng: np.random.Generator, length: int) -> dict:
     }
 
 
+def reward(rng: np.random.Generator, length: int) -> dict:
+    return {
+        "observation": arrays(rng, length + 1, 2),
+        "reward": arrays(rng, length + 1, 1),
+    }
+
+
 SPACES = {
+    reward: spaces.Dict({"observation": box(2), "reward": box(1)}),
+    foreign_goals: spaces.Dict(
+        {
+            "observation": box(5),
+            "desired_goal": box(2),
+            "camera": spaces.Box(0, 255, (4, 4, 1), np.uint8),
+            "phase": spaces.Discrete(3),
+        }
+    ),
     taken: spaces.Dict({"observation": box(2), "episode": box(1)}),
     flat: box(3),
     goal_env: spaces.Dict(
@@ -135,6 +161,21 @@ def test_goal_environment(tmp_path):
     assert rows["next", "achieved_goal", "kettle"].shape == (11, 2)
 
 
+def test_a_goal_environment_without_achieved_goals(tmp_path):
+    dataset, buffers = make_dataset(foreign_goals)
+    rows = load_minari(dataset, tmp_path / "rows", progress=False)
+    assert "achieved_goal" not in rows
+    assert rows["desired_goal"].shape == rows["next", "desired_goal"].shape == (11, 2)
+    assert rows["camera"].dtype == torch.uint8
+    assert rows["next", "camera"].shape == (11, 4, 4, 1)
+    states = [buffer.observations for buffer in buffers]
+    for key, dtype in (("phase", torch.int64), ("observation", torch.float32)):
+        now = np.concatenate([s[key][:-1] for s in states])
+        after = np.concatenate([s[key][1:] for s in states])
+        assert torch.equal(rows[key], torch.tensor(now).to(dtype))
+        assert torch.equal(rows["next", key], torch.tensor(after).to(dtype))
+
+
 def test_entities_as_dict(tmp_path):
     dataset, _ = make_dataset(parts)
     rows = load_minari(dataset, tmp_path / "rows", progress=False)
@@ -190,6 +231,32 @@ def narrow_action(number, buffer):
         object.__setattr__(buffer, "actions", buffer.actions[:, :1])
 
 
+def wide_goal(number, buffer):
+    if number == 2:
+        buffer.observations["desired_goal"] = np.zeros((7, 3))
+
+
+def no_goal(number, buffer):
+    if number == 1:
+        del buffer.observations["desired_goal"]
+
+
+def another_type(number, buffer):
+    if number == 1:
+        buffer.observations["phase"] = buffer.observations["phase"].astype(float)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "key"),
+    [(wide_goal, "desired_goal"), (no_goal, "desired_goal"), (another_type, "phase")],
+)
+def test_episodes_of_different_kinds(spoil, key, tmp_path):
+    dataset, _ = make_dataset(foreign_goals, spoil=spoil)
+    with pytest.raises(ValueError, match=rf"episode \d .*differ.*'{key}'"):
+        load_minari(dataset, tmp_path / "rows", progress=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["minari"]
+
+
 @pytest.mark.parametrize(
     ("spoil", "match"),
     [
@@ -207,9 +274,10 @@ def test_bad_episodes_leave_nothing(spoil, match, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["minari"]
 
 
-def test_an_entry_named_as_a_key_of_transitions(tmp_path):
-    dataset, _ = make_dataset(taken)
-    with pytest.raises(ValueError, match=r"entries named \['episode'\]"):
+@pytest.mark.parametrize(("observe", "name"), [(taken, "episode"), (reward, "reward")])
+def test_an_entry_named_as_a_key_of_transitions(observe, name, tmp_path):
+    dataset, _ = make_dataset(observe)
+    with pytest.raises(ValueError, match=rf"entries named \['{name}'\]"):
         load_minari(dataset, tmp_path / "rows", progress=False)
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +12,17 @@ from tensordict import TensorDict, TensorDictBase
 from tqdm.auto import tqdm
 
 from torchrl_caiac.data.load_transitions import load_transitions
+from torchrl_caiac.data.minari_files import whole_folder
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.dataset.episode_data import EpisodeData
 
 __all__ = ["load_minari"]
+
+# What an observation's entries must not be called.
+_TAKEN = {"action", "done", "episode", "info", "next"}
+_TAKEN |= {"reward", "terminated", "truncated"}
 
 
 def load_minari(
@@ -41,10 +43,9 @@ def load_minari(
     ``"truncated"`` and ``"done"`` (``[1]``). An episode's last row is always done: it
     counts as truncated where the file has no flag.
 
-    A dict of observations becomes nested keys. If it has the entries of a goal
-    environment, ``"observation"``, ``"achieved_goal"`` and ``"desired_goal"``, these
-    are keys at the root; other dicts lie under ``"observation"``. Floating-point
-    numbers become float32.
+    A dict of observations becomes keys at the root if it has an ``"observation"``, as
+    those of a goal environment, whatever else it has; other dicts lie under
+    ``"observation"``. Floating-point numbers become float32.
 
     Args:
         dataset (str or MinariDataset): the dataset, or its id.
@@ -70,11 +71,18 @@ def load_minari(
         KeyError: an episode lacks one of ``infos``.
 
     Examples:
-        >>> from torchrl_caiac.data import load_minari, offline_buffer
-        >>> rows = load_minari(
-        ...     "D4RL/kitchen/mixed-v2", "data/mixed", download=True
-        ... )  # doctest: +SKIP
-        >>> rb = offline_buffer(rows, batch_size=512)  # doctest: +SKIP
+        >>> import tempfile
+        >>> from torchrl_caiac.data import create_fetch_push_random, load_minari
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> dataset = create_fetch_push_random(
+        ...     episodes=2, steps=5, root=folder.name, workers=1, progress=False
+        ... )
+        >>> rows = load_minari(dataset, f"{folder.name}/rows", progress=False)
+        >>> rows["episode"]
+        MemoryMappedTensor([0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
+        >>> rows["next", "observation"].shape
+        torch.Size([10, 34])
+        >>> folder.cleanup()
     """
     import minari
 
@@ -92,15 +100,8 @@ def load_minari(
     ]
     if not sum(lengths):
         raise ValueError(f"the dataset {dataset.id} has no steps")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.partial-"))
-    try:
-        _fill(dataset, lengths, partial / "rows", columns, infos, progress)
-        if path.exists():
-            os.replace(path, partial / "replaced")
-        os.replace(partial / "rows", path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with whole_folder(path) as folder:
+        _fill(dataset, lengths, folder, columns, infos, progress)
     return load_transitions(path)
 
 
@@ -158,7 +159,7 @@ def _transitions(
     states = episode.observations
     if not isinstance(states, Mapping) or "observation" not in states:
         states = {"observation": states}
-    taken = sorted({"action", "episode", "info", "next"} & set(states))
+    taken = sorted(_TAKEN & set(states))
     if taken:
         raise ValueError(
             f"the observations in {where} have entries named {taken}, which are keys "

@@ -30,6 +30,7 @@ __all__ = [
     "open_minari",
     "publish_dataset",
     "stack_trees",
+    "whole_folder",
     "work_folder",
     "write_rows",
 ]
@@ -86,13 +87,19 @@ def free_dataset_path(
 
 
 def open_minari(
-    dataset_id: str, root: str | os.PathLike[str] | None = None
+    dataset_id: str,
+    root: str | os.PathLike[str] | None = None,
+    *,
+    download: bool = False,
 ) -> MinariDataset:
-    """Open a local Minari dataset.
+    """Open a Minari dataset.
 
     Args:
         dataset_id: Minari's name of the dataset.
         root: see :func:`dataset_path`.
+
+    Keyword Args:
+        download: fetch a dataset that is not there, to where it is looked for.
 
     Returns:
         the dataset.
@@ -100,15 +107,34 @@ def open_minari(
     Raises:
         FileNotFoundError: there is none of that name.
     """
-    from minari import MinariDataset
+    import minari
 
     data = dataset_path(dataset_id, root) / "data"
+    if not data.exists() and download:
+        with _datasets_in(root):
+            minari.download_dataset(dataset_id)
     if not data.exists():
         raise FileNotFoundError(
-            f"no Minari dataset {dataset_id!r} at {data.parent}; collect it first, or "
-            "say where it is with root= or MINARI_DATASETS_PATH"
+            f"no Minari dataset {dataset_id!r} at {data.parent}; collect it first, "
+            "pass download=True where there is a network, or say where it is with "
+            "root= or MINARI_DATASETS_PATH"
         )
-    return MinariDataset(data)
+    return minari.MinariDataset(data)
+
+
+@contextlib.contextmanager
+def _datasets_in(root: str | os.PathLike[str] | None) -> Iterator[None]:
+    """Let Minari's own functions work in a folder; where they do anyway for None."""
+    previous = os.environ.get("MINARI_DATASETS_PATH")
+    if root is not None:
+        os.environ["MINARI_DATASETS_PATH"] = str(Path(root).absolute())
+    try:
+        yield
+    finally:
+        if previous is None:
+            os.environ.pop("MINARI_DATASETS_PATH", None)
+        else:
+            os.environ["MINARI_DATASETS_PATH"] = previous
 
 
 @contextlib.contextmanager
@@ -167,39 +193,65 @@ def publish_dataset(
     place.mkdir(parents=True, exist_ok=True)
     env = make_env()
     partial = Path(tempfile.mkdtemp(dir=place, prefix=_PARTIAL))
-    previous = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(partial)
     try:
         bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
-        minari.create_dataset_from_buffers(
-            dataset_id,
-            bar,
-            env=env,
-            eval_env=env,
-            algorithm_name=algorithm_name,
-            author="torchrl-caiac",
-            author_email="none",
-            code_permalink=code,
-            description=description,
-            requirements=["gymnasium-robotics>=1.4,<1.5", "mujoco>=3.1,<3.12"],
-        )
+        with _datasets_in(partial):
+            minari.create_dataset_from_buffers(
+                dataset_id,
+                bar,
+                env=env,
+                eval_env=env,
+                algorithm_name=algorithm_name,
+                author="torchrl-caiac",
+                author_email="none",
+                code_permalink=code,
+                description=description,
+                requirements=["gymnasium-robotics>=1.4,<1.5", "mujoco>=3.1,<3.12"],
+            )
         built = partial / dataset_id
         target.parent.mkdir(parents=True, exist_ok=True)
         # Minari describes a namespace in a file of its own.
         for extra in built.parent.iterdir():
             if extra.is_file() and not (target.parent / extra.name).exists():
                 os.replace(extra, target.parent / extra.name)
-        if target.exists():
-            os.replace(target, partial / "replaced")
-        os.replace(built, target)
+        _swap(built, target, partial / "replaced")
     finally:
-        if previous is None:
-            del os.environ["MINARI_DATASETS_PATH"]
-        else:
-            os.environ["MINARI_DATASETS_PATH"] = previous
         shutil.rmtree(partial, ignore_errors=True)
         env.close()
     return MinariDataset(target / "data")
+
+
+@contextlib.contextmanager
+def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a folder to make, which is moved to its place when the block ends well.
+
+    Args:
+        path: the place; what is there is replaced then.
+
+    Yields:
+        a folder beside it that does not exist yet.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
+    try:
+        yield partial / "rows"
+        _swap(partial / "rows", path, partial / "replaced")
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _swap(made: Path, place: Path, replaced: Path) -> None:
+    """Move what was made to its place, and what was there before out of the way."""
+    there = place.exists()
+    if there:
+        os.replace(place, replaced)
+    try:
+        os.replace(made, place)
+    except OSError:
+        if there:
+            os.replace(replaced, place)
+        raise
 
 
 def write_rows(rows: TensorDict, path: str | os.PathLike[str]) -> TensorDict:
@@ -212,17 +264,9 @@ def write_rows(rows: TensorDict, path: str | os.PathLike[str]) -> TensorDict:
     Returns:
         the memory-mapped rows.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
-    try:
-        rows.memmap(partial / "rows")
-        if path.exists():
-            os.replace(path, partial / "replaced")
-        os.replace(partial / "rows", path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return load_transitions(path)
+    with whole_folder(path) as folder:
+        rows.memmap(folder)
+    return load_transitions(Path(path))
 
 
 def stack_trees(trees: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,0 +1,288 @@
+"""Mixtures: whole trajectories, shares, nested fractions, nothing half-written."""
+
+from __future__ import annotations
+
+import importlib
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import NonTensorData, TensorDict
+
+from torchrl_caiac.data import load_transitions, mix_trajectories, offline_buffer
+
+
+def source(lengths, *, first_id=0, id_shape=(), seed=0):
+    """Trajectories with ids that are neither 0, 1, ... nor in order."""
+    generator = torch.Generator().manual_seed(seed)
+    total = sum(lengths)
+    ids = first_id + 7 * torch.arange(len(lengths)).flip(0)
+    return TensorDict(
+        {
+            "observation": {"arm": torch.randn(total, 3, generator=generator)},
+            "action": torch.randn(total, 2, generator=generator).double(),
+            "episode": ids.repeat_interleave(torch.tensor(lengths)).view(
+                total, *id_shape
+            ),
+            "next": {"done": torch.rand(total, 1, generator=generator) < 0.5},
+        },
+        [total],
+    )
+
+
+def origins(rows):
+    """Source and original id of every trajectory, in the order of the rows."""
+    seen = zip(
+        rows["source"].tolist(), rows["source_episode"].flatten().tolist(), strict=True
+    )
+    return list(dict.fromkeys(seen))
+
+
+def assert_whole(rows, sources, key="episode"):
+    """Every trajectory of the mixture is one of its source's, row for row."""
+    begin = 0
+    found = origins(rows)
+    for number, (where, original) in enumerate(found):
+        there = sources[where]
+        theirs = there[there[key].flatten() == original]
+        mine = rows[begin : begin + len(theirs)]
+        assert mine[key].flatten().tolist() == [number] * len(theirs)
+        assert mine["source"].tolist() == [where] * len(theirs)
+        assert (mine["source_episode"] == theirs[key]).all()
+        kept = mine.exclude("source", "source_episode", key)
+        assert (kept == theirs.exclude(key)).all()
+        begin += len(theirs)
+    assert begin == len(rows)
+    assert len(set(found)) == len(found)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["memory", "memmap"])
+@pytest.mark.parametrize("id_shape", [(), (1,)])
+def test_expert_and_random(kind, id_shape, tmp_path):
+    sources = [
+        source([3, 1, 4, 2, 5, 2], id_shape=id_shape),
+        source([1 + i % 3 for i in range(20)], id_shape=id_shape, seed=1),
+    ]
+    if kind == "memmap":
+        sources = [s.memmap(tmp_path / str(i)) for i, s in enumerate(sources)]
+    before = [s.clone() for s in sources]
+    rows = mix_trajectories(sources, shares=(0.3, 0.7))
+    found = assert_whole(rows, sources)
+    assert [where for where, _ in found].count(0) == 6
+    assert len(found) == 20
+    assert rows["episode"].shape == (len(rows), *id_shape)
+    assert rows["source"].shape == (len(rows),)
+    assert rows["source"].dtype == rows["episode"].dtype == torch.int64
+    assert rows["action"].dtype == torch.float64
+    assert all((a == b).all() for a, b in zip(sources, before, strict=True))
+    # Sources drawn at random, not one after the other.
+    assert len({where for where, _ in found[:10]}) == 2
+
+
+def test_into_a_folder(tmp_path):
+    sources = [source([2, 3, 4]), source([1] * 7, seed=1).memmap(tmp_path / "random")]
+    mixed = mix_trajectories(sources, shares=(0.5, 0.5), seed=3)
+    stored = mix_trajectories(
+        sources, shares=(0.5, 0.5), seed=3, path=tmp_path / "deep" / "mixed"
+    )
+    assert stored.is_memmap()
+    assert (stored == mixed).all()
+    assert (load_transitions(tmp_path / "deep" / "mixed") == mixed).all()
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        mix_trajectories(sources, path=tmp_path / "deep" / "mixed")
+    other = mix_trajectories(sources, path=tmp_path / "deep" / "mixed", overwrite=True)
+    assert_whole(other, sources)
+    assert [entry.name for entry in (tmp_path / "deep").iterdir()] == ["mixed"]
+    batch = offline_buffer(other, batch_size=4).sample()
+    assert batch["source"].shape == (4,)
+
+
+def test_an_error_leaves_what_was_there(tmp_path, monkeypatch):
+    sources = [source([2, 3, 4])]
+    before = mix_trajectories(sources, path=tmp_path / "mixed").clone()
+
+    def full(*args):
+        raise OSError("disk full")
+
+    # The package's attribute of that name is the function.
+    module = importlib.import_module("torchrl_caiac.data.mix_trajectories")
+    monkeypatch.setattr(module, "_fill", full)
+    with pytest.raises(OSError, match="disk full"):
+        mix_trajectories(sources, path=tmp_path / "mixed", seed=1, overwrite=True)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["mixed"]
+    assert (load_transitions(tmp_path / "mixed") == before).all()
+
+
+counts = st.lists(st.integers(1, 30), min_size=1, max_size=4)
+
+
+@given(
+    counts,
+    st.data(),
+    st.integers(0, 3),
+    st.floats(0.05, 1.0),
+    st.floats(0.05, 1.0),
+    st.booleans(),
+)
+def test_fractions_are_nested_and_keep_the_shares(
+    counts, data, seed, one, other, given_shares
+):
+    sources = [
+        source([1 + (i + j) % 3 for j in range(count)], seed=i)
+        for i, count in enumerate(counts)
+    ]
+    weights = counts
+    if given_shares:
+        weights = data.draw(
+            st.lists(st.integers(1, 9), min_size=len(counts), max_size=len(counts))
+        )
+    shares = [weight / sum(weights) for weight in weights]
+    whole = mix_trajectories(
+        sources, shares=shares if given_shares else None, seed=seed
+    )
+    found = assert_whole(whole, sources)
+    total = len(found)
+    # The most of which no source's share is more than it has, but for rounding.
+    most = min(count / share for count, share in zip(counts, shares, strict=True))
+    assert most - len(counts) <= total <= most + 1e-6
+    if not given_shares:
+        assert total == sum(counts)
+    small, large = sorted((one, other))
+    parts = {}
+    for fraction in (small, large):
+        if round(fraction * total) == 0:
+            with pytest.raises(ValueError, match="not a single one"):
+                mix_trajectories(
+                    sources,
+                    shares=shares if given_shares else None,
+                    fraction=fraction,
+                    seed=seed,
+                )
+            continue
+        parts[fraction] = part = mix_trajectories(
+            sources,
+            shares=shares if given_shares else None,
+            fraction=fraction,
+            seed=seed,
+        )
+        taken = assert_whole(part, sources)
+        assert len(taken) == round(fraction * total)
+        assert (whole[: len(part)] == part).all()
+        for number, share in enumerate(shares):
+            drawn = [where for where, _ in taken].count(number)
+            # Two sources round to the nearest; more can be off by a little more.
+            off = 0.5 if len(shares) <= 2 else len(shares) / 2
+            assert abs(drawn - share * len(taken)) <= off + 1e-6
+    if len(parts) == 2:
+        assert set(origins(parts[small])) <= set(origins(parts[large]))
+
+
+def test_the_paper_s_sizes():
+    """600 expert and 1,400 random episodes; 100, 20 and 10 % of them."""
+    sources = [source([1] * 600), source([1] * 1400, seed=1)]
+    for fraction, expert in ((1.0, 600), (0.2, 120), (0.1, 60)):
+        rows = mix_trajectories(sources, shares=(0.3, 0.7), fraction=fraction)
+        assert rows["source"].bincount().tolist() == [expert, expert * 7 // 3]
+    rows = mix_trajectories(sources, shares=(0.5, 0.5))
+    assert rows["source"].bincount().tolist() == [600, 600]
+    rows = mix_trajectories(sources, shares=(0.1, 0.9), trajectories=1000)
+    assert rows["source"].bincount().tolist() == [100, 900]
+    part = mix_trajectories(sources, shares=(0.1, 0.9), trajectories=1000, fraction=0.1)
+    assert (part == rows[: len(part)]).all()
+    with pytest.raises(ValueError, match=r"1500, wanted 1 to 1200.*\[600, 1400\]"):
+        mix_trajectories(sources, shares=(0.5, 0.5), trajectories=1500)
+
+
+def test_seeds():
+    sources = [source([1] * 40), source([1] * 40, seed=1)]
+    one, again, other = (mix_trajectories(sources, seed=seed) for seed in (0, 0, 1))
+    assert (one == again).all()
+    assert origins(one) != origins(other)
+    assert set(origins(one)) == set(origins(other))
+    # The sources have streams of their own.
+    first, second = (
+        [original for where, original in origins(one) if where == number]
+        for number in (0, 1)
+    )
+    assert first != second
+
+
+def test_nested_keys():
+    sources = [source([2, 1]), source([3, 1, 1], seed=1)]
+    sources = [s.rename_key_("episode", ("meta", "traj")) for s in sources]
+    rows = mix_trajectories(
+        sources,
+        trajectory_key=("meta", "traj"),
+        source_key=("from", "source"),
+        source_trajectory_key=("from", "traj"),
+    )
+    assert rows["meta", "traj"].unique().tolist() == [0, 1, 2, 3, 4]
+    assert rows["from", "source"].bincount().tolist() == [3, 5]
+    assert set(rows["from", "traj"].tolist()) == {0, 7, 14}
+    assert ("from", "traj") not in sources[0].keys(include_nested=True)
+
+
+def test_mixtures_of_mixtures():
+    """What was mixed can be mixed again, under other names."""
+    rows = mix_trajectories([source([2, 1]), source([3, 1, 1], seed=1)])
+    with pytest.raises(ValueError, match="already has 'source'"):
+        mix_trajectories([rows, rows])
+    again = mix_trajectories(
+        [rows, rows], source_key="copy", source_trajectory_key="copy_episode"
+    )
+    assert len(again) == 2 * len(rows)
+    assert again["episode"].unique().tolist() == list(range(10))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"shares": [1.0]}, "1 shares .* for 2 sources"),
+        ({"shares": [0.3, 0.6]}, "sum 0.9; wanted positive numbers with sum 1"),
+        ({"shares": [1.0, 0.0]}, "leave sources without a share out"),
+        ({"shares": [1.5, -0.5]}, "wanted positive"),
+        ({"shares": [float("nan"), 0.5]}, "wanted positive"),
+        ({"fraction": 0.0}, "fraction is 0.0"),
+        ({"fraction": 1.1}, "fraction is 1.1"),
+        ({"fraction": float("nan")}, "fraction is nan"),
+        ({"fraction": 0.01}, "fraction 0.01 of 5 trajectories is not a single one"),
+        ({"trajectories": 0}, "trajectories is 0, wanted 1 to 5"),
+        ({"trajectories": 6}, r"trajectories is 6, wanted 1 to 5.*\[2, 3\]"),
+    ],
+)
+def test_bad_arguments(arguments, match, tmp_path):
+    sources = [source([2, 3]), source([1, 1, 2], seed=1)]
+    with pytest.raises(ValueError, match=match):
+        mix_trajectories(sources, path=tmp_path / "mixed", **arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_sources():
+    good = source([2, 3])
+    for sources in ([], good):
+        with pytest.raises(ValueError, match="at least one tensordict"):
+            mix_trajectories(sources)
+    scored = source([2, 3]).set(("caiac", "score"), torch.zeros(5, 2))
+    with pytest.raises(ValueError, match=r"source 1 has .*'caiac', 'score'.*exclude"):
+        mix_trajectories([good, scored])
+    with pytest.raises(ValueError, match=r"source 0 and source 1 differ.*action"):
+        mix_trajectories([good, source([2]).set("action", torch.zeros(2, 3))])
+    with pytest.raises(ValueError, match=r"differ.*float32"):
+        mix_trajectories([good, source([2]).apply(torch.Tensor.float)])
+    with pytest.raises(ValueError, match=r"source 1 has the batch size \[5, 1\]"):
+        mix_trajectories([good, good.unsqueeze(-1)])
+    with pytest.raises(ValueError, match=r"batch size \[0\]"):
+        mix_trajectories([good, good[:0]])
+    with pytest.raises(KeyError, match="source 0 has no tensor"):
+        mix_trajectories([good, good], trajectory_key="traj")
+    with pytest.raises(
+        ValueError, match=r"'action' of source 0 has the shape \(5, 2\)"
+    ):
+        mix_trajectories([good], trajectory_key="action")
+    with pytest.raises(ValueError, match="trajectory 7 of source 1 do not lie one"):
+        mix_trajectories([good, torch.cat([good, good[:2]])])
+    named = source([2]).set("name", NonTensorData("expert", [2]))
+    with pytest.raises(ValueError, match=r"'name'.*source 0 is no tensor"):
+        mix_trajectories([named])
