@@ -34,6 +34,16 @@ def test_what_was_written_is_read(tmp_path):
     assert (again["caiac", "score"] == 3).all()
 
 
+def test_opening_writes_nothing(tmp_path):
+    # Another process may be opening the same folder.
+    rows().memmap(tmp_path / "data")
+    before = {f: f.stat().st_mtime_ns for f in tmp_path.rglob("*")}
+    loaded = load_transitions(tmp_path / "data")
+    assert loaded["next"].is_memmap()
+    assert loaded["next"].is_locked
+    assert {f: f.stat().st_mtime_ns for f in tmp_path.rglob("*")} == before
+
+
 @pytest.mark.parametrize("name", ["observation", "next/observation", "odd%2Fkey"])
 @pytest.mark.parametrize("size", [0, 7, 4000])
 def test_a_truncated_file_is_noticed_and_left_as_it_is(name, size, tmp_path):

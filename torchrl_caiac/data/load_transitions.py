@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict._utils_key_json import _encode_key_for_filesystem
 from tensordict.utils import NestedKey
 
@@ -47,7 +47,7 @@ def load_transitions(
     Examples:
         >>> import tempfile
         >>> import torch
-        >>> from tensordict import TensorDict
+        >>> from tensordict import TensorDict, TensorDictBase
         >>> from torchrl_caiac.data.load_transitions import load_transitions
         >>> rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -75,8 +75,12 @@ def load_transitions(
             f"{path} lacks {missing}, it has {found}: it holds something else, or was "
             "made with other keys"
         )
-    # Loaded, a tensordict has mapped leaves but does not know it; nothing is copied.
-    return data.memmap_(path)
+    # Loaded, a tensordict has mapped leaves but does not know it. `memmap_` would tell
+    # it, and write the folder's meta.json anew while other processes may read it.
+    nodes = (v for v in data.values(True) if isinstance(v, TensorDictBase))
+    for node in (data, *nodes):
+        node._is_memmap = True
+    return data.lock_()
 
 
 def _check_folder(folder: Path, root: Path) -> list[int]:
