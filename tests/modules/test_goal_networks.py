@@ -1,0 +1,159 @@
+"""Tests of the goal-conditioned policy and action value."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules import (
+    GoalConditionedActor,
+    GoalConditionedCritic,
+    GoalFeatures,
+)
+
+LAYOUT = EntityLayout(
+    {"arm": [0, 1], "cup": [2, 3]},
+    goal={"cup": [0, 1]},
+    achieved={"cup": [2, 3]},
+    fixed=["arm"],
+)
+
+
+def rows(*batch: int, dtype=torch.float32) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(width: int) -> torch.Tensor:
+        return torch.randn(*batch, width, generator=generator, dtype=dtype)
+
+    return TensorDict(
+        {"observation": draw(4), "desired_goal": draw(2), "action": draw(3)}, batch
+    )
+
+
+def networks(dtype=None, **kwargs):
+    torch.manual_seed(0)
+    features = GoalFeatures(LAYOUT, reference="arm").fit_statistics(rows(200))
+    actor = GoalConditionedActor(features, 3, (32, 16), hidden_dtype=dtype, **kwargs)
+    return actor, GoalConditionedCritic(features, 3, (32, 16), hidden_dtype=dtype)
+
+
+def slow_network(features: torch.Tensor, parameters: list[torch.Tensor]):
+    """Linear layers with ReLU in between."""
+    for i in range(0, len(parameters), 2):
+        features = features @ parameters[i].T + parameters[i + 1]
+        if i + 2 < len(parameters):
+            features = features.clamp_min(0.0)
+    return features
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_values_against_matrix_products(batch, dtype):
+    actor, critic = (network.to(dtype) for network in networks(low=-2.0, high=1.0))
+    td = rows(*batch, dtype=dtype)
+    features = actor.features.forward_tensors(td["observation"], td["desired_goal"])
+    got = critic(td)["state_action_value"]
+    inputs = torch.cat([features, td["action"]], -1)
+    torch.testing.assert_close(got, slow_network(inputs, list(critic.parameters())))
+    assert got.shape == (*batch, 1) and got.dtype == dtype
+    want = slow_network(features, list(actor.parameters())).tanh()
+    got = actor(td)["action"]
+    torch.testing.assert_close(got, -0.5 + 1.5 * want)
+    assert got.shape == (*batch, 3) and got.dtype == dtype
+
+
+def test_bounds_per_column():
+    low, high = torch.tensor([-1.0, 0.0, 2.0]), torch.tensor([1.0, 0.5, 3.0])
+    actor, _ = networks(low=low, high=high)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.mul_(30.0)
+    action = actor(rows(500))["action"]
+    assert (action >= low - 1e-6).all() and (action <= high + 1e-6).all()
+    torch.testing.assert_close(action.amin(0), low)
+    torch.testing.assert_close(action.amax(0), high)
+
+
+def test_reduced_precision_keeps_the_weights():
+    full, half = networks(), networks(torch.bfloat16)
+    td = rows(300)
+    for a, b in zip(full, half, strict=True):
+        b.load_state_dict(a.state_dict())
+        want, got = (network(td.clone())[network.out_keys[0]] for network in (a, b))
+        assert got.dtype == torch.float32
+        error = (want - got).abs().max()
+        assert 0.0 < error < 0.02 * want.abs().max()
+        got.square().mean().backward()
+        want.square().mean().backward()
+        for p, q in zip(a.parameters(), b.parameters(), strict=True):
+            assert q.dtype == q.grad.dtype == torch.float32
+            assert (p.grad - q.grad).norm() < 0.05 * p.grad.norm()
+
+
+def test_networks_keep_the_features_they_were_made_of():
+    features = GoalFeatures(LAYOUT, reference="arm").fit_statistics(rows(200))
+    actor = GoalConditionedActor(features, 3, (16,))
+    critic = GoalConditionedCritic(features, 3, (16,))
+    before = [network(rows(4))[network.out_keys[0]] for network in (actor, critic)]
+    features.standardize.mean.add_(1.0)
+    for network, want in zip((actor, critic), before, strict=True):
+        torch.testing.assert_close(network(rows(4))[network.out_keys[0]], want)
+
+
+def test_nested_keys():
+    actor, critic = networks()
+    layout = EntityLayout(
+        dict(LAYOUT.columns),
+        goal=dict(LAYOUT.goal),
+        achieved=dict(LAYOUT.achieved),
+        fixed=["arm"],
+        observation_key=("agent", "state"),
+        desired_goal_key=("agent", "goal"),
+    )
+    features = GoalFeatures(layout, reference="arm")
+    key = ("agent", "act")
+    nested_actor = GoalConditionedActor(features, 3, (32, 16), action_key=key)
+    nested_critic = GoalConditionedCritic(
+        features, 3, (32, 16), action_key=key, out_key=("agent", "q")
+    )
+    nested_actor.load_state_dict(actor.state_dict())
+    nested_critic.load_state_dict(critic.state_dict())
+    td = rows(4)
+    nested = TensorDict(
+        {"agent": {"state": td["observation"], "goal": td["desired_goal"]}}, [4]
+    )
+    nested = nested_critic(nested_actor(nested))
+    td = critic(actor(td))
+    torch.testing.assert_close(nested[key], td["action"])
+    torch.testing.assert_close(nested["agent", "q"], td["state_action_value"])
+
+
+@pytest.mark.parametrize("cls", [GoalConditionedActor, GoalConditionedCritic])
+@pytest.mark.parametrize(
+    ("args", "kwargs", "match"),
+    [
+        ((0,), {}, "action_dim"),
+        ((2.0,), {}, "action_dim"),
+        ((2, ()), {}, "hidden_sizes"),
+        ((2, (16, 0)), {}, "hidden_sizes"),
+        ((2, (16,)), {"hidden_dtype": torch.int8}, "hidden_dtype"),
+    ],
+)
+def test_bad_arguments(cls, args, kwargs, match):
+    with pytest.raises(ValueError, match=match):
+        cls(GoalFeatures(LAYOUT), *args, **kwargs)
+
+
+def test_bad_bounds():
+    with pytest.raises(ValueError, match="below high"):
+        GoalConditionedActor(GoalFeatures(LAYOUT), 2, low=1.0, high=1.0)
+
+
+def test_bad_goals():
+    for network in networks():
+        td = rows(4)
+        td["desired_goal"] = torch.zeros(4, 5)
+        with pytest.raises(ValueError, match="'desired_goal' has 5 columns"):
+            network(td)

@@ -1,0 +1,440 @@
+"""TD3 for goals: own goal at the next step, bounded targets, cloning if wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data.tensor_specs import TensorSpec
+from torchrl.objectives import TD3Loss
+from torchrl.objectives.utils import _vmap_func, distance_loss
+
+from torchrl_caiac.modules.goal_features import read
+
+__all__ = ["GoalConditionedTD3Loss"]
+
+
+class GoalConditionedTD3Loss(TD3Loss):
+    """TorchRL's TD3 loss for goal-conditioned, offline and relabelled data.
+
+    It differs from :class:`~torchrl.objectives.TD3Loss` in this (paper, A.5.2):
+
+    - The next state is judged by the goal of its own row. A relabelled batch lacks
+      ``("next", "desired_goal")``, or holds the goal from before the relabelling;
+      it is never read. A missing next state raises instead of being taken for the
+      current one.
+    - Targets are clamped to what a return can be, as in Hindsight Experience Replay:
+      rewards in ``reward_bounds`` give returns in those bounds over ``1 - γ``.
+    - Values are bootstrapped unless ``("next", "terminated")`` is True. That leaf must
+      be there: the end of an episode by its time limit is no end of the task.
+    - The policy's loss may have a penalty on actions and a behaviour cloning term
+      (TD3+BC, Fujimoto & Gu 2021): ``-λ Q(s, g, π) + |π - a|² / A`` with
+      ``λ = bc_alpha / mean |Q|``, and rows can be left out of the latter:
+      counterfactual rows hold the expert's action for what it did before the swap.
+    - The policy's loss evaluates the first critic only.
+
+    Everything else, :meth:`make_value_estimator` with the discount, ``set_keys`` and
+    :class:`~torchrl.objectives.SoftUpdate` among it, works as in TorchRL.
+
+    Args:
+        actor_network (TensorDictModule): ``π(s, g)``, such as
+            :class:`~torchrl_caiac.modules.GoalConditionedActor`.
+        qvalue_network (TensorDictModule or list of it): ``Q(s, g, a)``. A list with one
+            module per critic keeps their weights; of a single one TorchRL makes
+            copies with uniformly drawn weights.
+
+    Keyword Args:
+        bounds (tuple of float, optional): the bounds of the actions. Defaults to
+            ``(-1.0, 1.0)`` where ``action_spec`` is not given.
+        action_spec (TensorSpec, optional): the bounds as a spec, instead of ``bounds``.
+        num_qvalue_nets (int): the number of critics; a list says it itself. Defaults
+            to 2.
+        reward_bounds (pair of float, optional): the least and the largest reward, from
+            which the bounds of the targets follow. Defaults to ``(-1.0, 0.0)``.
+        target_bounds (pair of float, optional): the bounds of the targets themselves,
+            instead of ``reward_bounds``. Targets are not clamped if both are ``None``.
+        action_penalty (float): weight of the policy's mean squared action. Defaults to
+            0.0.
+        bc_alpha (float, optional): the weight of the value against the behaviour
+            cloning term (TD3+BC: 2.5). ``None``, the default, leaves the term out.
+        bc_mask_key (NestedKey, optional): rows in which this bool leaf, ``[*B]`` or
+            ``[*B, 1]``, is True are left out of the behaviour cloning term, such as
+            ``("caiac", "counterfactual")``.
+        policy_noise (float): deviation of the noise on the target policy's action, in
+            units of the action. Defaults to 0.2.
+        noise_clip (float): the largest such noise. Defaults to 0.5.
+        loss_function (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``. Defaults to
+            ``"l2"`` (TD3's own).
+        **kwargs: further arguments of :class:`~torchrl.objectives.TD3Loss`, such as
+            ``reduction`` (``"mean"``, ``"sum"`` or ``"none"``).
+
+    Returns:
+        TensorDict: ``"loss_actor"`` and ``"loss_qvalue"`` (the sum over critics), and
+        detached, per row, ``"pred_value"`` (``[C, *B]`` for ``C`` critics),
+        ``"state_action_value_actor"``, ``"next_state_value"`` and ``"target_value"``
+        (``[*B]``); with ``bc_alpha`` the scalars ``"bc_loss"`` and ``"lmbd"`` too.
+
+    Raises:
+        ValueError: bounds are given twice or out of order, a weight is negative, or
+            ``bc_mask_key`` is given without ``bc_alpha``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules import (
+        ...     GoalConditionedActor,
+        ...     GoalConditionedCritic,
+        ...     GoalFeatures,
+        ... )
+        >>> from torchrl_caiac.objectives import GoalConditionedTD3Loss
+        >>> layout = EntityLayout(
+        ...     {"cube": [0, 1]}, goal={"cube": [0]}, achieved={"cube": [0]}
+        ... )
+        >>> features = GoalFeatures(layout)
+        >>> loss = GoalConditionedTD3Loss(
+        ...     GoalConditionedActor(features, 2, (16, 16)),
+        ...     [GoalConditionedCritic(features, 2, (16, 16)) for _ in range(2)],
+        ... )
+        >>> _ = loss.make_value_estimator(gamma=0.97)
+        >>> updater = SoftUpdate(loss, tau=0.005)
+        >>> td = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 2),
+        ...         "desired_goal": torch.randn(8, 1),
+        ...         "action": torch.rand(8, 2),
+        ...         "next": {
+        ...             "observation": torch.randn(8, 2),
+        ...             "reward": -torch.ones(8, 1),
+        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
+        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     [8],
+        ... )
+        >>> losses = loss(td)
+        >>> (losses["loss_actor"] + losses["loss_qvalue"]).backward()
+        >>> updater.step()
+    """
+
+    @dataclass
+    class _AcceptedKeys(TD3Loss._AcceptedKeys):
+        """The keys that ``set_keys`` accepts: those of TD3Loss and the goal.
+
+        Attributes:
+            desired_goal (NestedKey): the goal of a row, ``[*B, G]``, an input of the
+                networks. Defaults to ``"desired_goal"``.
+        """
+
+        desired_goal: NestedKey = "desired_goal"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    out_keys: Sequence[NestedKey] = (
+        "loss_actor",
+        "loss_qvalue",
+        "pred_value",
+        "state_action_value_actor",
+        "next_state_value",
+        "target_value",
+    )
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        bounds: tuple[float, float] | None = None,
+        action_spec: TensorSpec | None = None,
+        num_qvalue_nets: int = 2,
+        reward_bounds: tuple[float, float] | None = (-1.0, 0.0),
+        target_bounds: tuple[float, float] | None = None,
+        action_penalty: float = 0.0,
+        bc_alpha: float | None = None,
+        bc_mask_key: NestedKey | None = None,
+        policy_noise: float = 0.2,
+        noise_clip: float = 0.5,
+        loss_function: str = "l2",
+        **kwargs: Any,
+    ) -> None:
+        if target_bounds is not None:
+            if reward_bounds not in (None, (-1.0, 0.0)):
+                raise ValueError(
+                    f"targets are bounded by target_bounds={target_bounds!r} or by "
+                    f"reward_bounds={reward_bounds!r}: give one of them"
+                )
+            reward_bounds = None
+        for name, pair in (
+            ("reward_bounds", reward_bounds),
+            ("target_bounds", target_bounds),
+        ):
+            if pair is not None and not pair[0] < pair[1]:
+                raise ValueError(f"{name} is a pair (low, high), got {pair!r}")
+        if not action_penalty >= 0.0:
+            raise ValueError(f"action_penalty must be at least 0, got {action_penalty}")
+        if bc_alpha is not None and not bc_alpha >= 0.0:
+            raise ValueError(f"bc_alpha must be at least 0 or None, got {bc_alpha}")
+        if bc_mask_key is not None and bc_alpha is None:
+            raise ValueError(
+                f"bc_mask_key={bc_mask_key!r} masks the behaviour cloning term, which "
+                "bc_alpha=None leaves out: give bc_alpha"
+            )
+        if isinstance(qvalue_network, Sequence):
+            num_qvalue_nets = len(qvalue_network)
+        if bounds is None and action_spec is None:
+            bounds = (-1.0, 1.0)
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            bounds=bounds,
+            action_spec=action_spec,
+            num_qvalue_nets=num_qvalue_nets,
+            policy_noise=policy_noise,
+            noise_clip=noise_clip,
+            loss_function=loss_function,
+            **kwargs,
+        )
+        self.reward_bounds = reward_bounds
+        self._target_bounds = target_bounds
+        self.action_penalty = action_penalty
+        self.bc_alpha = bc_alpha
+        self.bc_mask_key = None if bc_mask_key is None else unravel_key(bc_mask_key)
+        if bc_alpha is not None:
+            self.out_keys = [*self.out_keys, "bc_loss", "lmbd"]
+
+    # --- keys --------------------------------------------------------------------
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        self._in_keys = list(
+            dict.fromkeys(
+                unravel_key(key)
+                for key in (
+                    keys.action,
+                    *self._state_keys,
+                    *(("next", key) for key in self._state_keys if not self._goal(key)),
+                    ("next", keys.reward),
+                    ("next", keys.done),
+                    ("next", keys.terminated),
+                    *([] if self.bc_mask_key is None else [self.bc_mask_key]),
+                )
+            )
+        )
+
+    @property
+    def _state_keys(self) -> list[NestedKey]:
+        """What the networks read but the action."""
+        inputs = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        keys = [key for key in dict.fromkeys(inputs) if key != self.tensor_keys.action]
+        if not any(map(self._goal, keys)):
+            raise ValueError(
+                f"the networks read {keys}, and the goal "
+                f"{self.tensor_keys.desired_goal!r} is not among them: name its key "
+                "with set_keys(desired_goal=...)"
+            )
+        return keys
+
+    def _goal(self, key: NestedKey) -> bool:
+        return unravel_key(key) == unravel_key(self.tensor_keys.desired_goal)
+
+    # --- targets -----------------------------------------------------------------
+
+    def make_value_estimator(
+        self, value_type: Any = None, **hyperparams: Any
+    ) -> GoalConditionedTD3Loss:
+        """Chooses the estimator of the targets, as in TorchRL.
+
+        Args:
+            value_type (ValueEstimators, ValueEstimatorBase or type, optional): the
+                estimator, its kind, or its class. Defaults to ``ValueEstimators.TD0``.
+            **hyperparams: of the estimator, such as ``gamma``, by default 0.99.
+
+        Returns:
+            GoalConditionedTD3Loss: the loss itself.
+
+        Raises:
+            ValueError: the targets' bounds follow from those of the rewards, but
+                ``gamma`` is not below 1.
+        """
+        super().make_value_estimator(value_type, **hyperparams)
+        # An estimator that was passed in has default keys until it is told.
+        self._forward_value_estimator_keys()
+        gamma = float(self.value_estimator.gamma)
+        if self.reward_bounds is not None and not gamma < 1.0:
+            raise ValueError(
+                f"gamma is {gamma}, and returns of rewards within {self.reward_bounds} "
+                "have no bounds: give target_bounds, or reward_bounds=None"
+            )
+        return self
+
+    @property
+    def target_bounds(self) -> tuple[Any, Any] | None:
+        """What the targets are clamped to, ``None`` if they are not."""
+        if self.reward_bounds is None:
+            return self._target_bounds
+        low, high = self.reward_bounds
+        horizon = 1.0 / (1.0 - self.value_estimator.gamma)
+        return low * horizon, high * horizon
+
+    # --- losses ------------------------------------------------------------------
+
+    def actor_loss(
+        self, tensordict: TensorDictBase
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """The policy's loss; the critics get no gradient.
+
+        Args:
+            tensordict (TensorDictBase): transitions ``[*B]``; left as they are.
+
+        Returns:
+            tuple: the loss, and detached ``"state_action_value_actor"`` ``[*B]`` and,
+            with ``bc_alpha``, the scalars ``"bc_loss"`` and ``"lmbd"``.
+        """
+        weights = self._maybe_get_priority_weight(tensordict)
+        inputs = self._inputs(tensordict, self._state_keys)
+        with self.actor_network_params.to_module(
+            self.actor_network, preserve_module_state=False
+        ):
+            inputs = self.actor_network(inputs)
+        action = inputs.get(self.tensor_keys.action)
+        # Not detach(): tensordict caches it, and it would miss a change of dtype.
+        with self.qvalue_network_params.data[0].to_module(
+            self.qvalue_network, preserve_module_state=False
+        ):
+            inputs = self.qvalue_network(inputs)
+        value = inputs.get(self.tensor_keys.state_action_value).squeeze(-1)
+        metadata = {"state_action_value_actor": value.detach()}
+        loss = -value
+        if self.bc_alpha is not None:
+            size = self._reduce_loss(value.detach().abs(), tensordict, reduction="mean")
+            metadata["lmbd"] = self.bc_alpha / size.clamp_min(1e-8)
+            error = self._cloning_error(action, tensordict)
+            metadata["bc_loss"] = self._reduce_loss(
+                error.detach(), tensordict, reduction="mean"
+            )
+            loss = metadata["lmbd"] * loss + error
+        if self.action_penalty:
+            loss = loss + self.action_penalty * action.square().mean(-1)
+        loss = self._reduce_loss(loss, tensordict, weights=weights)
+        return loss, metadata
+
+    def value_loss(
+        self, tensordict: TensorDictBase
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """The critics' loss; the policy gets no gradient.
+
+        Args:
+            tensordict (TensorDictBase): transitions ``[*B]``; left as they are.
+
+        Returns:
+            tuple: the loss, and detached ``"td_error"`` and ``"pred_value"``
+            ``[C, *B]``, ``"next_state_value"`` and ``"target_value"`` ``[*B]``.
+        """
+        keys = self.tensor_keys
+        weights = self._maybe_get_priority_weight(tensordict)
+        inputs = self._inputs(tensordict, [*self._state_keys, keys.action])
+        action = inputs.get(keys.action)
+        noise = (torch.randn_like(action) * self.policy_noise).clamp(
+            -self.noise_clip, self.noise_clip
+        )
+        with torch.no_grad():
+            after = self._inputs(tensordict, self._state_keys, after=True)
+            with self.target_actor_network_params.to_module(
+                self.actor_network, preserve_module_state=False
+            ):
+                after = self.actor_network(after)
+            after.set(
+                keys.action,
+                (after.get(keys.action) + noise).clamp(
+                    self.min_action, self.max_action
+                ),
+            )
+            next_value = self._values(after, self.target_qvalue_network_params).amin(0)
+            target = self._target(tensordict, next_value)
+        value = self._values(inputs, self.qvalue_network_params)
+        loss = distance_loss(value, target.expand_as(value), self.loss_function).sum(0)
+        metadata = {
+            "td_error": (value.detach() - target).square(),
+            "next_state_value": next_value,
+            "pred_value": value.detach(),
+            "target_value": target,
+        }
+        loss = self._reduce_loss(loss, tensordict, weights=weights)
+        return loss, metadata
+
+    def _make_vmap(self) -> None:
+        super()._make_vmap()
+        # The critics share their input, so that only their weights are mapped over.
+        self._vmap_qvalue_networkN0 = _vmap_func(
+            self.qvalue_network,
+            (None, 0),
+            randomness=self.vmap_randomness,
+            pseudo_vmap=self.deactivate_vmap,
+        )
+
+    def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> torch.Tensor:
+        """Values of all critics, ``[C, *B]``."""
+        out = self._vmap_qvalue_networkN0(inputs, params)
+        value: torch.Tensor = out.get(self.tensor_keys.state_action_value)
+        return value.squeeze(-1)
+
+    def _target(
+        self, tensordict: TensorDictBase, next_value: torch.Tensor
+    ) -> torch.Tensor:
+        keys = self.tensor_keys
+        for name in (keys.reward, keys.terminated):
+            shape = read(tensordict, [("next", name)])[0].shape
+            if shape != (*next_value.shape, 1):
+                raise ValueError(
+                    f"{('next', name)!r} has the shape {list(shape)}, wanted "
+                    f"{[*next_value.shape, 1]}"
+                )
+        target: torch.Tensor = self.value_estimator.value_estimate(
+            tensordict, next_value=next_value.unsqueeze(-1)
+        ).squeeze(-1)
+        bounds = self.target_bounds
+        return target if bounds is None else target.clamp(*bounds)
+
+    def _cloning_error(
+        self, action: torch.Tensor, tensordict: TensorDictBase
+    ) -> torch.Tensor:
+        """The squared error of the actions, ``[*B]``; its mean is that of kept rows."""
+        (expert,) = read(tensordict, [self.tensor_keys.action])
+        error = (action - expert).square().mean(-1)
+        if self.bc_mask_key is None:
+            return error
+        (masked,) = read(tensordict, [self.bc_mask_key])
+        if masked.dtype != torch.bool or masked.numel() != error.numel():
+            raise ValueError(
+                f"{self.bc_mask_key!r} has the shape {list(masked.shape)} and dtype "
+                f"{masked.dtype}, wanted a bool {[*error.shape, 1]}, True in rows "
+                "that are not cloned"
+            )
+        kept = ~masked.reshape(error.shape)
+        error = error.where(kept, torch.zeros_like(error))
+        return error * (kept.numel() / kept.sum().clamp_min(1))
+
+    # --- reading -----------------------------------------------------------------
+
+    def _inputs(
+        self,
+        tensordict: TensorDictBase,
+        keys: Sequence[NestedKey],
+        *,
+        after: bool = False,
+    ) -> TensorDict:
+        """The networks' inputs, of the next state if ``after``, with the row's goal."""
+        sources = [
+            ("next", key) if after and not self._goal(key) else key for key in keys
+        ]
+        return TensorDict(
+            dict(zip(keys, read(tensordict, sources), strict=True)),
+            tensordict.batch_size,
+            device=tensordict.device,
+        )
