@@ -19,6 +19,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence import cai
 from torchrl_caiac.influence.cai import CAI, causal_action_influence, draw_actions
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
 
 APPROXIMATIONS: tuple[Any, ...] = ("bounds", "product")
 LAYOUT = EntityLayout({"arm": [0, 1], "cup": [3, 2, 4]})
@@ -407,6 +408,9 @@ def test_wrong_arguments_are_named() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             CAI(model, **kwargs)  # type: ignore[arg-type]
+    transformer = TransformerWorldModel(LAYOUT, 2, layers=1, heads=1, width=4)
+    with pytest.raises(TypeError, match="a TransformerWorldModel has no distribution"):
+        CAI(transformer)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="Bounded spec, got Unbounded"):
         CAI(model, action_spec=Unbounded((2,)))  # type: ignore[arg-type]
     with pytest.raises(KeyError, match="observation"):

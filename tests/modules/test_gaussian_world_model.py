@@ -161,7 +161,7 @@ def test_statistics_by_chunks_and_from_several_sources(
     )
     whole.fit_statistics(td)
     monkeypatch.setattr(
-        "torchrl_caiac.modules.gaussian_world_model._STATISTICS_ROWS", 10
+        "torchrl_caiac.modules.entity_dynamics_model._STATISTICS_ROWS", 10
     )
     chunked.fit_statistics(td.memmap(tmp_path))
     several.fit_statistics([td[:30], td[30:].reshape(71, 1)])

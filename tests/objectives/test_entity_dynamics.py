@@ -1,4 +1,4 @@
-"""Tests of the loss of the Gaussian world model."""
+"""Tests of the loss of world models."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
 from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss, gaussian_nll
 
 LAYOUT = EntityLayout({"arm": [0, 1], "cup": [2]})
@@ -162,6 +163,35 @@ def test_entity_mse_is_in_physical_units(functional: bool, target: Any) -> None:
     error = model.eval().predict_next(td) - td["next", "observation"]
     torch.testing.assert_close(mse["arm"], error[:, :2].square().mean())
     torch.testing.assert_close(mse["cup"], error[:, 2:].square().mean())
+
+
+@pytest.mark.parametrize("functional", [True, False])
+@pytest.mark.parametrize("batch", [(9,), (3, 4)])
+def test_transformers_minimise_the_squared_error(functional: bool, batch: Any) -> None:
+    td = transitions(*batch)
+    torch.manual_seed(0)
+    model = TransformerWorldModel(LAYOUT, 2, layers=2, heads=2, width=8)
+    model.fit_statistics(td)
+    loss = EntityDynamicsLoss(model, functional=functional, reduction="none")
+    model(td.clone())  # makes the statistics of the inputs
+    loss.eval()
+    out = loss(td)
+    target = model.targets(td)
+    with torch.no_grad():
+        error = (model(td.clone())["prediction", "loc"] - target).square().mean(-1)
+    torch.testing.assert_close(out["mse"], error)
+    torch.testing.assert_close(out["loss_nll"].detach(), 0.5 * error)
+    # Gaussian likelihood with unit variance, up to the constant.
+    loc = loss.model.forward_tensors(LAYOUT.read(td), td["action"])[0]
+    unit = gaussian_nll(loc, torch.ones_like(loc), target)
+    constant = unit.detach() - out["loss_nll"].detach()
+    torch.testing.assert_close(constant, torch.full(batch, 0.9189385))
+    out["loss_nll"].mean().backward()
+    assert all(parameter.grad is not None for parameter in loss.parameters())
+    physical = loss.entity_mse(td)
+    error = (model.predict_next(td) - td["next", "observation"]).square().detach()
+    torch.testing.assert_close(physical["arm"], error[..., :2].mean())
+    torch.testing.assert_close(physical["cup"], error[..., 2:].mean())
 
 
 def test_wrong_arguments() -> None:

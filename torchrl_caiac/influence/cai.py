@@ -11,10 +11,8 @@ from torch import nn
 from torchrl.data import Bounded
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.modules.gaussian_world_model import (
-    GaussianWorldModel,
-    evaluating,
-)
+from torchrl_caiac.modules.entity_dynamics_model import evaluating
+from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 
 __all__ = ["CAI", "causal_action_influence", "draw_actions"]
 
@@ -216,7 +214,7 @@ class CAI(nn.Module):
     Raises:
         ValueError: the model does not predict an entity; the action spec has another
             size or no finite bounds; ``num_actions`` is below 2.
-        TypeError: the action spec is not bounded.
+        TypeError: the model is not Gaussian, or the action spec is not bounded.
 
     Examples:
         >>> import torch
@@ -255,6 +253,11 @@ class CAI(nn.Module):
             )
         if max_memory < 1:
             raise ValueError(f"max_memory is a number of bytes, got {max_memory!r}")
+        if not isinstance(model, GaussianWorldModel):
+            raise TypeError(
+                f"a {type(model).__name__} has no distribution to compare: give a "
+                "GaussianWorldModel"
+            )
         missing = [n for n in model.layout.names if n not in model.predicted]
         if missing:
             raise ValueError(

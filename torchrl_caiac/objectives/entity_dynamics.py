@@ -1,8 +1,7 @@
-"""The loss that fits a Gaussian world model to transitions."""
+"""The loss that fits a world model to transitions."""
 
 from __future__ import annotations
 
-import math
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -13,36 +12,13 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
-from torchrl_caiac.modules.gaussian_world_model import (
-    GaussianWorldModel,
+from torchrl_caiac.modules.entity_dynamics_model import (
+    EntityDynamicsModel,
     evaluating,
 )
+from torchrl_caiac.modules.gaussian_world_model import gaussian_nll
 
 __all__ = ["EntityDynamicsLoss", "gaussian_nll"]
-
-_LOG_2PI = math.log(2 * math.pi)
-
-
-def gaussian_nll(
-    loc: torch.Tensor, var: torch.Tensor, target: torch.Tensor
-) -> torch.Tensor:
-    """The negative log likelihood under diagonal Gaussians, mean over columns.
-
-    Args:
-        loc (torch.Tensor): means ``[*B, P]``.
-        var (torch.Tensor): variances ``[*B, P]``.
-        target (torch.Tensor): ``[*B, P]``.
-
-    Returns:
-        torch.Tensor: nats per column, ``[*B]``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.objectives.entity_dynamics import gaussian_nll
-        >>> gaussian_nll(torch.zeros(1, 2), torch.ones(1, 2), torch.zeros(1, 2))
-        tensor([0.9189])
-    """
-    return 0.5 * (var.log() + (target - loc).square() / var + _LOG_2PI).mean(-1)
 
 
 class EntityDynamicsLoss(LossModule):
@@ -53,7 +29,9 @@ class EntityDynamicsLoss(LossModule):
     are those of the model's layout.
 
     Args:
-        model (GaussianWorldModel): the model to fit.
+        model (EntityDynamicsModel): the model to fit. A
+            :class:`~torchrl_caiac.modules.TransformerWorldModel` has the likelihood of
+            a Gaussian of unit variance, up to a constant: half the squared error.
 
     Keyword Args:
         functional (bool): keep the parameters in a
@@ -104,20 +82,21 @@ class EntityDynamicsLoss(LossModule):
     default_keys = _AcceptedKeys
     out_keys: ClassVar[list[NestedKey]] = ["loss_nll", "mse"]
 
-    model: GaussianWorldModel
+    model: EntityDynamicsModel
     model_params: TensorDictParams | None
     target_model_params: TensorDictParams | None
 
     def __init__(
         self,
-        model: GaussianWorldModel,
+        model: EntityDynamicsModel,
         *,
         functional: bool = True,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        if not isinstance(model, GaussianWorldModel):
+        if not isinstance(model, EntityDynamicsModel):
             raise TypeError(
-                f"the loss takes a GaussianWorldModel, got {type(model).__name__}"
+                "the loss takes a TransformerWorldModel or a GaussianWorldModel, got "
+                f"{type(model).__name__}"
             )
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction is 'mean', 'sum' or 'none', got {reduction!r}")
@@ -169,14 +148,14 @@ class EntityDynamicsLoss(LossModule):
         state = model.layout.read(tensordict)
         target = model.targets(tensordict)
         with self._parameters_in():
-            loc, var = model.forward_tensors(
+            prediction = model.forward_tensors(
                 state, tensordict.get(self.tensor_keys.action)
             )
-        error = (target - loc.detach()).square().mean(-1)
+        error = (target - prediction[0].detach()).square().mean(-1)
         out = TensorDict(
             {
                 "loss_nll": self._reduce_loss(
-                    gaussian_nll(loc, var, target), tensordict
+                    model.nll(prediction, target), tensordict
                 ),
                 "mse": self._reduce_loss(error, tensordict),
             }
@@ -201,11 +180,11 @@ class EntityDynamicsLoss(LossModule):
         model, layout = self.model, self.model.layout
         with evaluating(model), self._parameters_in():
             state = layout.read(tensordict)
-            loc, _ = model.forward_tensors(
+            prediction = model.forward_tensors(
                 state, tensordict.get(self.tensor_keys.action)
             )
         after = layout.read(tensordict, next=True)[..., model.index]
-        error = (model.physical(state, loc) - after).square()
+        error = (model.physical(state, prediction[0]) - after).square()
         return TensorDict(
             {name: error[..., where].mean() for name, where in model.predicted.items()}
         )

@@ -1,4 +1,4 @@
-"""Fitting a Gaussian world model to stored transitions."""
+"""Fitting a world model to stored transitions."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 from tqdm.auto import tqdm
 
-from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
-from torchrl_caiac.objectives.entity_dynamics import gaussian_nll
+from torchrl_caiac.modules.entity_dynamics_model import (
+    EntityDynamicsModel,
+    with_class,
+)
 
 __all__ = ["fit_world_model"]
 
@@ -31,7 +33,7 @@ _EVAL_ROWS = 4_096  # rows through the network at once in validation
 
 
 def fit_world_model(
-    model: GaussianWorldModel,
+    model: EntityDynamicsModel,
     data: TensorDictBase | Sequence[TensorDictBase],
     *,
     steps: int = 100_000,
@@ -61,7 +63,7 @@ def fit_world_model(
     never interrupted; a larger ``steps`` goes on further.
 
     Args:
-        model (GaussianWorldModel): the model, changed in place.
+        model (EntityDynamicsModel): the model, changed in place.
         data (TensorDictBase or sequence of it): transitions ``[T]``, in memory or
             memmap. Trajectories of several data sets are told apart.
 
@@ -185,8 +187,8 @@ def fit_world_model(
         while fit.step < steps:
             choice = torch.randint(len(train), (batch_size,), generator=generator)
             state, action, raw = rows.get(train[choice])
-            loc, var = model.forward_tensors(state, action)
-            loss = gaussian_nll(loc, var, model.normalise(raw)).mean()
+            prediction = model.forward_tensors(state, action)
+            loss = model.nll(prediction, model.normalise(raw)).mean()
             fit.optimizer.zero_grad()
             loss.backward()
             fit.optimizer.step()
@@ -215,7 +217,7 @@ class _Rows:
 
     def __init__(
         self,
-        model: GaussianWorldModel,
+        model: EntityDynamicsModel,
         sources: Sequence[TensorDictBase],
         max_memory: int,
     ) -> None:
@@ -233,7 +235,7 @@ class _Rows:
         self.starts = torch.tensor([0, *self.lengths]).cumsum(0)
         self.sizes = [model.state_dim, model.action_dim, model.predict_dim]
         width = sum(self.sizes)
-        self.device = model.loc_head.weight.device
+        self.device = model.device
         self.block: torch.Tensor | None = None
         if total * width * 4 <= max_memory:
             self.block = torch.empty(total, width)
@@ -316,13 +318,13 @@ class _Fit:
 
     def __init__(
         self,
-        model: GaussianWorldModel,
+        model: EntityDynamicsModel,
         lr: float,
         generator: torch.Generator,
         settings: dict[str, Any],
     ) -> None:
         self.model = model
-        fused = model.loc_head.weight.device.type in ("cpu", "cuda")
+        fused = model.device.type in ("cpu", "cuda")
         self.optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=fused)
         self.generator = generator
         self.settings = settings
@@ -330,9 +332,7 @@ class _Fit:
         self.best: dict[str, Any] = {}
         self.best_nll = math.inf
         self.history: list[dict[str, float]] = []
-        self.train_sum = torch.zeros(
-            (), dtype=torch.float64, device=model.loc_head.weight.device
-        )
+        self.train_sum = torch.zeros((), dtype=torch.float64, device=model.device)
         self.train_count = 0
 
     @torch.no_grad()
@@ -344,10 +344,11 @@ class _Fit:
         error = torch.zeros(model.predict_dim, dtype=torch.float64)
         for part in index.split(_EVAL_ROWS):
             state, action, raw = rows.get(part)
-            loc, var = model.forward_tensors(state, action)
+            prediction = model.forward_tensors(state, action)
             target = model.normalise(raw)
-            nll += gaussian_nll(loc, var, target).sum(dtype=torch.float64).cpu()
-            error += (target - loc).square().sum(0, dtype=torch.float64).cpu()
+            nll += model.nll(prediction, target).sum(dtype=torch.float64).cpu()
+            square = (target - prediction[0]).square()
+            error += square.sum(0, dtype=torch.float64).cpu()
         model.train()
         # In physical units the error of change and of absolute targets is the same.
         error *= model.target_scale.cpu().square() / len(index)
@@ -434,6 +435,7 @@ class _Fit:
                 f"{_FORMAT!r}: {advice}"
             )
         settings = json.loads(saved["settings"])
+        settings["model"] = with_class(settings["model"])
         wanted = json.loads(json.dumps(self.settings))
         for name, value in wanted.items():
             if settings.get(name) != value:

@@ -1,0 +1,179 @@
+"""The local causal graph that a transformer's attention suggests (CoDA)."""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules.entity_dynamics_model import evaluating
+from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
+
+__all__ = ["AttentionInfluence"]
+
+_CPU_ROWS = 2**9  # rows through the network at once on a CPU: more leave its cache
+
+
+class AttentionInfluence(nn.Module):
+    r"""Scores influence by the attention of a transformer world model (paper, A.7).
+
+    With :math:`A_l` the attention matrix of layer ``l`` (queries by keys, mean over
+    the heads), the output of token ``j`` attends to the input of token ``i`` by
+    :math:`(A_L \cdots A_1)_{ji}`. That is the score of the edge
+    :math:`s_i \rightarrow s'_j`; the scores of all edges into one entity sum to 1.
+
+    :func:`~torchrl_caiac.influence.score_buffer` caches the graphs, which
+    :class:`~torchrl_caiac.transforms.CoDATransform` reads. With ``action_only`` there
+    is one score an entity, that of the edge from the action, which
+    :class:`~torchrl_caiac.transforms.CAIACTransform` reads: CoDA-action.
+
+    Args:
+        model (TransformerWorldModel): a fitted world model that predicts every entity.
+        action_only (bool): give the action's row alone. Defaults to ``False``.
+
+    Keyword Args:
+        max_memory (int): bytes of working memory above model, data and scores, about;
+            the rows are scored in chunks that fit. Defaults to 256 MiB.
+
+    Raises:
+        TypeError: the model has no attention to record.
+        ValueError: the model does not predict an entity.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.influence import AttentionInfluence
+        >>> from torchrl_caiac.modules import TransformerWorldModel
+        >>> layout = EntityLayout({"arm": [0, 1], "cup": [2]})
+        >>> model = TransformerWorldModel(layout, 2, layers=2, heads=2, width=8)
+        >>> td = TensorDict(
+        ...     {"observation": torch.randn(5, 3), "action": torch.randn(5, 2)}, [5]
+        ... )
+        >>> graph = AttentionInfluence(model)(td)
+        >>> graph.shape  # from the arm, the cup and the action to the arm and the cup
+        torch.Size([5, 3, 2])
+        >>> torch.equal(AttentionInfluence(model, action_only=True)(td), graph[:, -1])
+        True
+    """
+
+    def __init__(
+        self,
+        model: TransformerWorldModel,
+        action_only: bool = False,
+        *,
+        max_memory: int = 256 * 2**20,
+    ) -> None:
+        super().__init__()
+        if not isinstance(model, TransformerWorldModel):
+            raise TypeError(
+                f"a {type(model).__name__} has no attention to record: give a "
+                "TransformerWorldModel"
+            )
+        missing = [n for n in model.layout.names if n not in model.predicted]
+        if missing:
+            raise ValueError(
+                f"the model predicts no column of {missing}: every entity needs a "
+                "score, predict at least one column of each"
+            )
+        if max_memory < 1:
+            raise ValueError(f"max_memory is a number of bytes, got {max_memory!r}")
+        self.model = model
+        self.action_only = bool(action_only)
+        self.max_memory = int(max_memory)
+
+    @property
+    def layout(self) -> EntityLayout:
+        """The entities that are scored: the model's."""
+        return self.model.layout
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What is read: the state and the action."""
+        return self.model.in_keys
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """The graph's scores; without gradients, in evaluation mode.
+
+        Args:
+            tensordict (TensorDictBase): states and actions ``[*B]``; nothing is
+                written.
+
+        Returns:
+            torch.Tensor: float32 ``[*B, N + 1, N]``: from the row (the entities in
+            layout order, then the action) to the column; with ``action_only`` the
+            last row alone, ``[*B, N]``.
+
+        Raises:
+            KeyError: the action is missing.
+            ValueError: an observation or an action is not finite, or the attention is
+                not.
+        """
+        model, n = self.model, self.layout.num_entities
+        state = self.layout.read(tensordict)
+        action = tensordict.get(model.action_key, None)
+        if action is None:
+            raise KeyError(
+                f"attention reads the action {model.action_key!r}, which the data "
+                "lack: name it by the model's action_key"
+            )
+        batch = state.shape[:-1]
+        state = state.reshape(-1, state.shape[-1])
+        action = action.reshape(-1, action.shape[-1])
+        shape = (n,) if self.action_only else (n + 1, n)
+        scores = torch.empty(len(state), *shape, device=state.device)
+        rows = self.chunk_rows
+        with evaluating(model):
+            for start in range(0, len(state), rows):
+                part = slice(start, start + rows)
+                model.check_finite(state[part], first_row=start)
+                model.check_finite_action(action[part], first_row=start)
+                graph = self._graph(
+                    state[part].to(model.device), action[part].to(model.device)
+                )
+                self._check(graph, start)
+                scores[part] = graph[:, -1] if self.action_only else graph
+        return scores.reshape(*batch, *shape)
+
+    def _graph(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        layers = self.model.attention(state, action).float().unbind(-3)
+        total = reduce(lambda below, above: above @ below, layers)
+        # From queries by keys to causes by effects; nothing acts on the action.
+        return total[:, : self.layout.num_entities].mT
+
+    def _check(self, graph: torch.Tensor, first_row: int) -> None:
+        finite = torch.isfinite(graph)
+        if bool(finite.all()):
+            return
+        names = [
+            name
+            for name, ok in zip(
+                self.layout.names, finite.all(1).all(0).tolist(), strict=True
+            )
+            if not ok
+        ]
+        row = int((~finite).flatten(1).any(1).nonzero()[0, 0]) + first_row
+        raise ValueError(
+            f"the attention that {names} pay is NaN or infinite, first in row {row}: "
+            "the model has diverged, or the states are far outside of its data"
+        )
+
+    @property
+    def chunk_rows(self) -> int:
+        """How many rows pass the network at once."""
+        model = self.model
+        tokens = self.layout.num_entities + 1
+        # Of a layer's activations, with queries, keys and values; of its attention.
+        per_token = 8 * model.width + 2 * model.feedforward
+        per_token += (2 * model.heads + 2 * len(model.layers)) * tokens
+        rows = max(1, self.max_memory // (4 * tokens * per_token))
+        return min(rows, _CPU_ROWS) if model.device.type == "cpu" else rows
+
+    def extra_repr(self) -> str:
+        """The settings, for ``repr``."""
+        return f"action_only={self.action_only}"

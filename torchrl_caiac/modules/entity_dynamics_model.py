@@ -1,0 +1,608 @@
+"""What world models share: normalised targets, checks, and saving."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal, TypeVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import nn
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules.running_norm import RunningNorm
+
+__all__ = ["EntityDynamicsModel", "evaluating", "with_class"]
+
+_Model = TypeVar("_Model", bound="EntityDynamicsModel")
+
+_STATISTICS_ROWS = 65_536  # rows read at once where statistics are gathered
+
+
+class EntityDynamicsModel(TensorDictModuleBase):
+    r"""A model of how the action moves every entity, without its network.
+
+    It reads the features of all ``N`` entities (``W`` numbers,
+    :meth:`EntityLayout.read`) and the action (``A``), and predicts ``P`` columns of
+    the next state. Subclasses define two methods: ``forward_tensors(state, action)``,
+    a tuple of the tensors under :attr:`out_keys`, the expectation of the normalised
+    target first, and ``nll(prediction, target)``, what
+    :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises. They normalise
+    their inputs by ``state_norm`` and ``action_norm``, and add their own arguments to
+    :attr:`config`.
+
+    The *normalised target* is by default the change of each column over the step,
+    divided by its standard deviation in the data, or by the floor where that is
+    smaller.
+
+    Args:
+        layout (EntityLayout): the entities.
+        action_dim (int): the size ``A`` of the action.
+        predict (mapping of str to iterable of int, optional): the columns to predict of
+            some entities; the others are predicted whole. Flat layouts: observation
+            columns that the entity owns. Nested layouts: positions in the entity's
+            flattened features. ``()`` leaves an entity out (it then has no score).
+
+    Keyword Args:
+        widths (mapping of str to int, optional): the features of each entity,
+            ``layout.widths(td)``. Needed by nested layouts only.
+        action_key (NestedKey): defaults to ``"action"``.
+        out_keys (sequence of NestedKey): where the prediction is written.
+        target (str): ``"change"`` (next minus now) or ``"absolute"`` (the next state,
+            centred). Defaults to ``"change"``.
+        variance_floor (float or mapping): a standard deviation in physical units:
+            columns that change less are not blown up to unit variance. One number, or
+            per entity one number or one for each predicted column. Defaults to
+            ``1e-3`` (1 mm, 1 mrad).
+
+    Attributes:
+        predicted (dict of str to slice): where each predicted entity lies in ``P``.
+        slices (dict of str to slice): where each entity lies in ``W``.
+
+    Raises:
+        ValueError: an argument does not fit the layout.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
+        >>> class Linear(EntityDynamicsModel):
+        ...     def __init__(self, layout, action_dim):
+        ...         super().__init__(layout, action_dim, out_keys=["change"])
+        ...         self.map = torch.nn.Linear(self.state_dim, self.predict_dim)
+        ...     def forward_tensors(self, state, action):
+        ...         return (self.map(self.state_norm(state)),)
+        ...     def nll(self, prediction, target):
+        ...         return (prediction[0] - target).square().mean(-1)
+        >>> model = Linear(EntityLayout({"arm": [0, 1], "cup": [2]}), 2)
+        >>> model(observation=torch.zeros(5, 3), action=torch.zeros(5, 2)).shape
+        torch.Size([5, 3])
+        >>> model.slices
+        {'arm': slice(0, 2, None), 'cup': slice(2, 3, None)}
+    """
+
+    def __init__(
+        self,
+        layout: EntityLayout,
+        action_dim: int,
+        predict: Mapping[str, Iterable[int]] | None = None,
+        *,
+        widths: Mapping[str, int] | None = None,
+        action_key: NestedKey = "action",
+        out_keys: Sequence[NestedKey],
+        target: Literal["change", "absolute"] = "change",
+        variance_floor: float | Mapping[str, float | Sequence[float]] = 1e-3,
+    ) -> None:
+        super().__init__()
+        if not isinstance(action_dim, int) or action_dim < 1:
+            raise ValueError(
+                f"action_dim is the size of the action, an int of at least 1, got "
+                f"{action_dim!r}"
+            )
+        if target not in ("change", "absolute"):
+            raise ValueError(f"target is 'change' or 'absolute', got {target!r}")
+        self.layout = layout
+        self.action_dim = action_dim
+        self.target = target
+        self.action_key: NestedKey = unravel_key(action_key)
+        self.in_keys = [*layout.in_keys, self.action_key]
+        self.out_keys = [unravel_key(key) for key in out_keys]
+        self.fitted = False
+
+        self.widths = _checked_widths(layout, widths)
+        self.predict = _checked_predict(layout, self.widths, predict)
+        floor = _checked_floor(variance_floor, self.predict)
+        self.slices: dict[str, slice] = {}
+        self.predicted: dict[str, slice] = {}
+        start = stop = 0
+        index: list[int] = []
+        for name, positions in self.predict.items():
+            self.slices[name] = slice(start, start + self.widths[name])
+            index += [start + position for position in positions]
+            start += self.widths[name]
+            if positions:
+                self.predicted[name] = slice(stop, stop + len(positions))
+                stop += len(positions)
+        self.state_dim, self.predict_dim = start, stop
+
+        self.state_norm = RunningNorm(self.state_dim)
+        self.action_norm = RunningNorm(action_dim)
+        self.index: torch.Tensor
+        self.floor: torch.Tensor
+        self.target_loc: torch.Tensor
+        self.target_scale: torch.Tensor
+        self.register_buffer("index", torch.tensor(index), persistent=False)
+        self.register_buffer("floor", torch.tensor(floor, dtype=torch.float64))
+        zeros = torch.zeros(self.predict_dim, dtype=torch.float64)
+        self.register_buffer("target_loc", zeros)
+        self.register_buffer("target_scale", torch.ones_like(zeros))
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The dtype of the parameters."""
+        return next(self.parameters()).dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model computes."""
+        return self.target_loc.device
+
+    # --- predicting --------------------------------------------------------------
+
+    def forward_tensors(
+        self, state: torch.Tensor, action: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """The prediction of the normalised target, from tensors.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+            action (torch.Tensor): ``[*B, A]``; batch dimensions broadcast.
+
+        Returns:
+            tuple of torch.Tensor: the expectation ``[*B, P]``, and what else there is,
+            in the order of :attr:`out_keys`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no forward_tensors")
+
+    def nll(
+        self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
+    ) -> torch.Tensor:
+        """The negative log likelihood of a target, up to a constant.
+
+        Args:
+            prediction (tuple of torch.Tensor): what :meth:`forward_tensors` gave.
+            target (torch.Tensor): normalised targets ``[*B, P]``.
+
+        Returns:
+            torch.Tensor: nats per column, ``[*B]``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no nll")
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the prediction of the normalised target.
+
+        Args:
+            tensordict (TensorDictBase): states and actions ``[*B]``.
+
+        Returns:
+            TensorDictBase: the same, with :attr:`out_keys` set, each ``[*B, P]``.
+        """
+        prediction = self.forward_tensors(
+            self.layout.read(tensordict), tensordict.get(self.action_key)
+        )
+        for key, value in zip(self.out_keys, prediction, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def _check_widths(self, state: torch.Tensor, action: torch.Tensor) -> None:
+        for name, x, size in (
+            ("state", state, self.state_dim),
+            ("action", action, self.action_dim),
+        ):
+            if x.ndim < 1 or x.shape[-1] != size:
+                raise ValueError(
+                    f"the {name} has the shape {list(x.shape)}, but this model reads "
+                    f"[*B, {size}]: pass the data that the model was made for"
+                )
+
+    def predict_next(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """The expected next state, in physical units.
+
+        Args:
+            tensordict (TensorDictBase): states and actions ``[*B]``; nothing is
+                written.
+
+        Returns:
+            torch.Tensor: the predicted columns of all entities, ``[*B, P]``.
+
+        Raises:
+            RuntimeError: :meth:`fit_statistics` was never called.
+        """
+        state = self.layout.read(tensordict)
+        prediction = self.forward_tensors(state, tensordict.get(self.action_key))
+        return self.physical(state, prediction[0])
+
+    # --- targets -----------------------------------------------------------------
+
+    def raw_targets(
+        self, state: torch.Tensor, next_state: torch.Tensor
+    ) -> torch.Tensor:
+        """The target in physical units: the change, or the next state.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+            next_state (torch.Tensor): the same after the step.
+
+        Returns:
+            torch.Tensor: ``[*B, P]``.
+        """
+        after = next_state[..., self.index]
+        return after - state[..., self.index] if self.target == "change" else after
+
+    def normalise(self, raw: torch.Tensor) -> torch.Tensor:
+        """The normalised target of a raw one, in the dtype of the parameters.
+
+        Args:
+            raw (torch.Tensor): what :meth:`raw_targets` gave, ``[*B, P]``.
+
+        Returns:
+            torch.Tensor: ``[*B, P]``.
+
+        Raises:
+            RuntimeError: :meth:`fit_statistics` was never called.
+        """
+        self._check_fitted()
+        loc, scale = (x.to(raw.dtype) for x in (self.target_loc, self.target_scale))
+        return ((raw - loc) / scale).to(self.dtype)
+
+    def physical(self, state: torch.Tensor, loc: torch.Tensor) -> torch.Tensor:
+        """The next state that a normalised target stands for.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+            loc (torch.Tensor): a normalised target, ``[*B, P]``.
+
+        Returns:
+            torch.Tensor: the predicted columns, ``[*B, P]``, in physical units.
+
+        Raises:
+            RuntimeError: :meth:`fit_statistics` was never called.
+        """
+        self._check_fitted()
+        raw = loc * self.target_scale.to(loc.dtype) + self.target_loc.to(loc.dtype)
+        return raw + state[..., self.index] if self.target == "change" else raw
+
+    def targets(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """The normalised targets of transitions.
+
+        Args:
+            tensordict (TensorDictBase): transitions ``[*B]`` with next states.
+
+        Returns:
+            torch.Tensor: ``[*B, P]``.
+
+        Raises:
+            RuntimeError: :meth:`fit_statistics` was never called.
+        """
+        layout = self.layout
+        return self.normalise(
+            self.raw_targets(
+                layout.read(tensordict), layout.read(tensordict, next=True)
+            )
+        )
+
+    def fit_statistics(
+        self,
+        data: TensorDictBase | torch.Tensor | Iterable[TensorDictBase | torch.Tensor],
+    ) -> None:
+        """Sets the scale (and for absolute targets the centre) of the targets.
+
+        Each predicted column gets the standard deviation of its raw target, but never
+        less than its floor.
+
+        Args:
+            data (TensorDictBase or torch.Tensor or iterable of them): transitions
+                ``[T]``, read in chunks, or raw targets ``[T, P]``, or several.
+
+        Raises:
+            ValueError: there is no row, or a value is not finite.
+        """
+        stats = RunningNorm(self.predict_dim).to(self.target_loc.device)
+        for raw in self._raw_chunks(data):
+            stats.update(raw)
+        if not stats.count:
+            raise ValueError("there is no row to take the statistics from")
+        if not bool(torch.isfinite(stats.var).all()):
+            bad = (~torch.isfinite(stats.var)).nonzero()[0].item()
+            name = self._owner(self.predicted, int(bad))
+            raise ValueError(
+                f"the changes of entity {name!r} are not finite: remove the rows with "
+                "NaN or infinite observations"
+            )
+        scale = stats.var.sqrt()
+        self.target_scale.copy_(torch.maximum(scale, self.floor))
+        # A column at rest whose floor is 0 has no scale at all.
+        self.target_scale[self.target_scale == 0] = 1.0
+        if self.target == "absolute":
+            self.target_loc.copy_(stats.mean)
+        self.fitted = True
+
+    def _raw_chunks(self, data: Any) -> Iterator[torch.Tensor]:
+        layout, device = self.layout, self.target_loc.device
+        single = isinstance(data, (TensorDictBase, torch.Tensor))
+        for part in [data] if single else data:
+            if isinstance(part, torch.Tensor):
+                yield from part.to(device).split(_STATISTICS_ROWS)
+                continue
+            if not part.numel():
+                continue
+            rows = part if part.batch_dims == 1 else part.reshape(-1)
+            for start in range(0, len(rows), _STATISTICS_ROWS):
+                td = rows[start : start + _STATISTICS_ROWS].to(device)
+                yield self.raw_targets(layout.read(td), layout.read(td, next=True))
+
+    def check_finite(
+        self, state: torch.Tensor, *, next: bool = False, first_row: int = 0
+    ) -> None:
+        """Raises when a state holds NaN or an infinity, naming entity and row.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+
+        Keyword Args:
+            next (bool): these are next states. Defaults to ``False``.
+            first_row (int): added to the row in the message. Defaults to 0.
+
+        Raises:
+            ValueError: a value is not finite.
+        """
+        finite = torch.isfinite(state)
+        if bool(finite.all()):
+            return
+        flat = finite.reshape(-1, self.state_dim)
+        row, column = (~flat).nonzero()[0].tolist()
+        value = state.reshape(-1, self.state_dim)[row, column].item()
+        name = self._owner(self.slices, column)
+        key: Any = self.layout.observation_key or self.layout.keys[name]
+        key = self.layout.next(key) if next else key
+        raise ValueError(
+            f"{key!r} is {value} for entity {name!r} in row {first_row + row} "
+            f"({int((~flat).any(-1).sum())} such rows): the world model needs finite "
+            "observations, remove or repair these rows"
+        )
+
+    def check_finite_action(self, action: torch.Tensor, *, first_row: int = 0) -> None:
+        """Raises when an action holds NaN or an infinity, naming the row.
+
+        Args:
+            action (torch.Tensor): ``[*B, A]``.
+
+        Keyword Args:
+            first_row (int): added to the row in the message. Defaults to 0.
+
+        Raises:
+            ValueError: a value is not finite.
+        """
+        finite = torch.isfinite(action)
+        if bool(finite.all()):
+            return
+        flat = finite.reshape(-1, finite.shape[-1])
+        row, column = (~flat).nonzero()[0].tolist()
+        value = action.reshape(-1, action.shape[-1])[row, column].item()
+        raise ValueError(
+            f"{self.action_key!r} is {value} in column {column} of row "
+            f"{first_row + row} ({int((~flat).any(-1).sum())} such rows): the world "
+            "model needs finite actions, remove or repair these rows"
+        )
+
+    @staticmethod
+    def _owner(slices: Mapping[str, slice], column: int) -> str:
+        return next(n for n, s in slices.items() if s.start <= column < s.stop)
+
+    def _check_fitted(self) -> None:
+        if not self.fitted:
+            raise RuntimeError(
+                "the scale of the targets is not known yet: call "
+                "model.fit_statistics(data), or fit_world_model(model, data), first"
+            )
+
+    # --- saving ------------------------------------------------------------------
+    @property
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model, and its class, JSON-compatible."""
+        floor = self.floor.tolist()
+        return {
+            "class": type(self).__name__,
+            "layout": self.layout.to_dict(),
+            "action_dim": self.action_dim,
+            "widths": dict(self.widths),
+            "predict": {n: list(c) for n, c in self._predict_columns().items()},
+            "action_key": _jsonable(self.action_key),
+            "out_keys": [_jsonable(key) for key in self.out_keys],
+            "target": self.target,
+            "variance_floor": {n: floor[s] for n, s in self.predicted.items()},
+        }
+
+    @classmethod
+    def from_config(cls: type[_Model], config: Mapping[str, Any]) -> _Model:
+        """Makes an untrained model like the one that :attr:`config` came from.
+
+        Args:
+            config (mapping): the :attr:`config` of a model of this class.
+
+        Returns:
+            EntityDynamicsModel: the model.
+
+        Raises:
+            ValueError: the config is of another class.
+
+        Examples:
+            >>> from torchrl_caiac import EntityLayout
+            >>> from torchrl_caiac.modules import GaussianWorldModel
+            >>> model = GaussianWorldModel(EntityLayout({"arm": [0, 1]}), 2, (8,))
+            >>> twin = GaussianWorldModel.from_config(model.config)
+            >>> twin.load_state_dict(model.state_dict())
+            <All keys matched successfully>
+        """
+        kwargs = with_class(config)
+        named = kwargs.pop("class")
+        if named != cls.__name__:
+            raise ValueError(
+                f"the config is that of a {named}, not of a {cls.__name__}: call "
+                f"{named}.from_config"
+            )
+        kwargs["layout"] = EntityLayout.from_dict(kwargs["layout"])
+        kwargs["action_key"] = _key(kwargs["action_key"])
+        kwargs["out_keys"] = [_key(key) for key in kwargs["out_keys"]]
+        return cls(**kwargs)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What ``state_dict`` holds beside tensors: arguments, and whether fitted."""
+        return {"config": json.dumps(self.config), "fitted": self.fitted}
+
+    def set_extra_state(self, state: Any) -> None:
+        """Restores what :meth:`get_extra_state` gave."""
+        self.fitted = bool(state["fitted"])
+
+    def _load_from_state_dict(
+        self, state_dict: Any, prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        # Compared before any tensor is copied: a refused model stays as it was.
+        extra = state_dict.get(f"{prefix}_extra_state")
+        if extra is not None:
+            found, wanted = with_class(json.loads(extra["config"])), self.config
+            for name, value in json.loads(json.dumps(wanted)).items():
+                if found.get(name) == value:
+                    continue
+                if name == "layout":
+                    found[name] = EntityLayout.from_dict(found[name])
+                    value = self.layout
+                raise ValueError(
+                    f"the saved world model has another {name}, saved:\n"
+                    f"{found.get(name)}\nthis model:\n{value}\nMake the model with "
+                    f"the arguments that were saved ({found['class']}.from_config)"
+                )
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def _predict_columns(self) -> dict[str, tuple[int, ...]]:
+        if not self.layout.is_flat:
+            return self.predict
+        columns = self.layout.columns
+        return {n: tuple(columns[n][p] for p in ps) for n, ps in self.predict.items()}
+
+
+@contextmanager
+def evaluating(module: nn.Module) -> Iterator[None]:
+    """Puts a module in evaluation mode, and each part back as it was."""
+    modes = [(part, part.training) for part in module.modules()]
+    module.eval()
+    try:
+        yield
+    finally:
+        for part, training in modes:
+            part.training = training
+
+
+def with_class(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a model's config that names its class, as those of 0.1.0 do not."""
+    return {"class": "GaussianWorldModel", **config}
+
+
+def _jsonable(key: Any) -> Any:
+    return list(key) if isinstance(key, tuple) else key
+
+
+def _key(key: Any) -> Any:
+    return tuple(key) if isinstance(key, list) else key
+
+
+def _checked_widths(
+    layout: EntityLayout, widths: Mapping[str, int] | None
+) -> dict[str, int]:
+    if layout.is_flat:
+        own = layout.widths()
+        if widths is not None and dict(widths) != own:
+            raise ValueError(
+                f"widths are {dict(widths)}, but the layout's columns make {own}: "
+                "leave widths out for a flat layout"
+            )
+        return own
+    if widths is None:
+        raise ValueError(
+            "the features of a nested layout are counted in the data: pass "
+            "widths=layout.widths(td) with an example tensordict"
+        )
+    if set(widths) != set(layout.names):
+        raise ValueError(
+            f"widths name {sorted(widths)}, but the layout has {list(layout.names)}"
+        )
+    for name, width in widths.items():
+        if not isinstance(width, int) or width < 1:
+            raise ValueError(
+                f"the width of entity {name!r} must be an int of at least 1, got "
+                f"{width!r}"
+            )
+    return {name: widths[name] for name in layout.names}
+
+
+def _checked_predict(
+    layout: EntityLayout,
+    widths: Mapping[str, int],
+    predict: Mapping[str, Iterable[int]] | None,
+) -> dict[str, tuple[int, ...]]:
+    """The positions to predict in each entity's features, in layout order."""
+    predict = {} if predict is None else predict
+    unknown = [name for name in predict if name not in layout.names]
+    if unknown:
+        raise ValueError(
+            f"predict names {unknown}, which are no entities of this layout: it has "
+            f"{list(layout.names)}"
+        )
+    positions: dict[str, tuple[int, ...]] = {}
+    for name in layout.names:
+        own = layout.columns[name] if layout.is_flat else tuple(range(widths[name]))
+        columns = tuple(predict.get(name, own))
+        foreign = [column for column in columns if column not in own]
+        if foreign or len(set(columns)) != len(columns):
+            what = f"{foreign}, which it does not own" if foreign else f"{columns}"
+            raise ValueError(
+                f"predict gives entity {name!r} the columns {what}: name each of its "
+                f"columns {list(own)} at most once"
+            )
+        positions[name] = tuple(own.index(column) for column in columns)
+    if not any(positions.values()):
+        raise ValueError("predict leaves nothing to predict: give it some columns")
+    return positions
+
+
+def _checked_floor(
+    floor: float | Mapping[str, float | Sequence[float]],
+    predict: Mapping[str, tuple[int, ...]],
+) -> list[float]:
+    if isinstance(floor, Mapping):
+        wanted = [name for name, positions in predict.items() if positions]
+        if set(floor) - set(predict) or set(wanted) - set(floor):
+            raise ValueError(
+                f"variance_floor names {sorted(floor)}, but the predicted entities are "
+                f"{wanted}: give each its own floor, or one float for all"
+            )
+        per_entity = {name: floor[name] for name in wanted}
+    else:
+        per_entity = {name: floor for name, positions in predict.items() if positions}
+    floors: list[float] = []
+    for name, value in per_entity.items():
+        count = len(predict[name])
+        values = list(value) if isinstance(value, Sequence) else [value] * count
+        if len(values) != count or any(not 0 <= v < float("inf") for v in values):
+            raise ValueError(
+                f"variance_floor of entity {name!r} is {value!r}, wanted a standard "
+                "deviation in physical units, not negative, or one for each of its "
+                f"{count} predicted columns"
+            )
+        floors += [float(v) for v in values]
+    return floors

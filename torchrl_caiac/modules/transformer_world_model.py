@@ -1,0 +1,273 @@
+"""A transformer over entities, whose attention is read as influence by CoDA."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
+
+__all__ = ["TransformerWorldModel"]
+
+
+class TransformerWorldModel(EntityDynamicsModel):
+    r"""The transition model that CoDA reads the local graph from (paper, A.7).
+
+    Every entity is one token, in layout order, and the action is the last one. A
+    learnt projection of its own takes each token's features (normalised by a running
+    mean and variance) to ``width`` dimensions, ``layers`` of
+    :class:`torch.nn.TransformerEncoderLayer` follow, and a learnt projection of its
+    own takes each entity's output to the expected *normalised target*
+    (:class:`EntityDynamicsModel`). The projections tell the tokens apart; there is no
+    other encoding of their positions.
+
+    The likelihood that :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises
+    is that of a Gaussian of unit variance, without its constant: half the squared
+    error.
+
+    Args:
+        layout (EntityLayout): the entities.
+        action_dim (int): the size ``A`` of the action.
+        layers (int): encoder layers. Defaults to 3.
+        heads (int): attention heads a layer, a divisor of ``width``. Defaults to 4.
+        width (int): the size of the tokens. Defaults to 128.
+        predict (mapping of str to iterable of int, optional): the columns to predict of
+            some entities, as in :class:`EntityDynamicsModel`.
+
+    Keyword Args:
+        feedforward (int, optional): the hidden width between two attentions. Defaults
+            to ``width``; the paper names no other size.
+        dropout (float): in every layer, while training. Defaults to 0.
+        widths (mapping of str to int, optional): the features of each entity,
+            ``layout.widths(td)``. Needed by nested layouts only.
+        action_key (NestedKey): defaults to ``"action"``.
+        out_keys (sequence of one NestedKey): where the expectation ``[*B, P]`` is
+            written. Defaults to ``("prediction", "loc")``.
+        target (str): ``"change"`` (next minus now) or ``"absolute"`` (the next state,
+            centred). Defaults to ``"change"``.
+        variance_floor (float or mapping): a standard deviation in physical units:
+            columns that change less are not blown up to unit variance. One number, or
+            per entity one number or one for each predicted column. Defaults to
+            ``1e-3`` (1 mm, 1 mrad).
+
+    Attributes:
+        predicted (dict of str to slice): where each predicted entity lies in ``P``.
+
+    Raises:
+        ValueError: an argument is out of range or does not fit the layout.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules import TransformerWorldModel
+        >>> layout = EntityLayout({"arm": [0, 1], "cup": [2, 3, 4]})
+        >>> model = TransformerWorldModel(layout, 2, layers=2, heads=2, width=16)
+        >>> td = TensorDict(
+        ...     {"observation": torch.randn(8, 5), "action": torch.randn(8, 2)}, [8]
+        ... )
+        >>> model(td)["prediction", "loc"].shape
+        torch.Size([8, 5])
+        >>> model.attention(layout.read(td), td["action"]).shape
+        torch.Size([8, 2, 3, 3])
+    """
+
+    def __init__(
+        self,
+        layout: EntityLayout,
+        action_dim: int,
+        layers: int = 3,
+        heads: int = 4,
+        width: int = 128,
+        predict: Mapping[str, Iterable[int]] | None = None,
+        *,
+        feedforward: int | None = None,
+        dropout: float = 0.0,
+        widths: Mapping[str, int] | None = None,
+        action_key: NestedKey = "action",
+        out_keys: Sequence[NestedKey] = (("prediction", "loc"),),
+        target: Literal["change", "absolute"] = "change",
+        variance_floor: float | Mapping[str, float | Sequence[float]] = 1e-3,
+    ) -> None:
+        feedforward = width if feedforward is None else feedforward
+        for name, value in (
+            ("layers", layers),
+            ("heads", heads),
+            ("width", width),
+            ("feedforward", feedforward),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
+        if width % heads:
+            raise ValueError(
+                f"{heads} heads do not divide the width {width}: each head gets "
+                "width / heads dimensions, change one of them"
+            )
+        if not 0 <= dropout < 1:
+            raise ValueError(f"dropout lies in [0, 1), got {dropout!r}")
+        if len(tuple(out_keys)) != 1:
+            raise ValueError(
+                f"out_keys is one key, of the expectation, got {out_keys!r}"
+            )
+        super().__init__(
+            layout,
+            action_dim,
+            predict,
+            widths=widths,
+            action_key=action_key,
+            out_keys=out_keys,
+            target=target,
+            variance_floor=variance_floor,
+        )
+        self.heads = heads
+        self.width = width
+        self.feedforward = feedforward
+        self.dropout = float(dropout)
+        self.inputs = nn.ModuleList(
+            nn.Linear(size, width) for size in (*self.widths.values(), action_dim)
+        )
+        # Not nn.TransformerEncoder: its layers all begin with the same weights.
+        self.layers = nn.ModuleList(
+            nn.TransformerEncoderLayer(
+                width, heads, feedforward, self.dropout, batch_first=True
+            )
+            for _ in range(layers)
+        )
+        self.outputs = nn.ModuleList(
+            nn.Linear(width, where.stop - where.start)
+            for where in self.predicted.values()
+        )
+        self._predicted_tokens = [layout.index(name) for name in self.predicted]
+
+    def forward_tensors(
+        self, state: torch.Tensor, action: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """The expectation of the normalised target, from tensors.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+            action (torch.Tensor): ``[*B, A]``; batch dimensions broadcast.
+
+        Returns:
+            tuple of torch.Tensor: the expectation ``[*B, P]`` alone.
+
+        Raises:
+            ValueError: a last dimension has another size.
+        """
+        tokens, batch = self._tokens(state, action)
+        tokens = self._encode(tokens)
+        parts = [
+            output(tokens[:, token])
+            for output, token in zip(self.outputs, self._predicted_tokens, strict=True)
+        ]
+        return (torch.cat(parts, -1).reshape(*batch, self.predict_dim),)
+
+    def nll(
+        self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
+    ) -> torch.Tensor:
+        """The negative log likelihood under unit variance, without its constant.
+
+        Args:
+            prediction (tuple of torch.Tensor): the expectation, ``[*B, P]``.
+            target (torch.Tensor): normalised targets ``[*B, P]``.
+
+        Returns:
+            torch.Tensor: half the mean squared error, ``[*B]``.
+        """
+        return 0.5 * (target - prediction[0]).square().mean(-1)
+
+    def attention(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """The attention matrices of all layers, mean over the heads.
+
+        Hooks record them, so let no other thread use the model meanwhile.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+            action (torch.Tensor): ``[*B, A]``; batch dimensions broadcast.
+
+        Returns:
+            torch.Tensor: ``[*B, layers, N + 1, N + 1]``: how much the token of the
+            row (a query) attends to that of the column (a key); entities in layout
+            order, then the action. Rows sum to 1.
+
+        Raises:
+            RuntimeError: a layer gave no attention.
+            ValueError: a last dimension has another size.
+        """
+        tokens, batch = self._tokens(state, action)
+        size = tokens.shape[1]
+        if not tokens.shape[0]:  # torch's fused attention then returns no weights
+            return tokens.new_zeros(*batch, len(self.layers), size, size)
+        with _recording(list(self.layers)) as weights:
+            self._encode(tokens)
+        return torch.stack(weights, 1).reshape(*batch, len(weights), size, size)
+
+    def _tokens(
+        self, state: torch.Tensor, action: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Size]:
+        """The input tokens ``[rows, N + 1, width]``, and the batch's shape."""
+        self._check_widths(state, action)
+        last: Any = self.inputs[-1]
+        dtype = last.weight.dtype
+        state = self.state_norm(state.to(dtype))
+        action = self.action_norm(action.to(dtype))
+        batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
+        parts = [*state.split(list(self.widths.values()), -1), action]
+        tokens = [
+            project(part).expand(*batch, self.width)
+            for project, part in zip(self.inputs, parts, strict=True)
+        ]
+        return torch.stack(tokens, -2).reshape(-1, len(tokens), self.width), batch
+
+    def _encode(self, tokens: torch.Tensor) -> torch.Tensor:
+        for layer in self.layers:
+            tokens = layer(tokens)
+        return tokens
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The arguments that make this model, and its class, JSON-compatible."""
+        return {
+            **super().config,
+            "layers": len(self.layers),
+            "heads": self.heads,
+            "width": self.width,
+            "feedforward": self.feedforward,
+            "dropout": self.dropout,
+        }
+
+
+@contextmanager
+def _recording(layers: Sequence[Any]) -> Iterator[list[torch.Tensor]]:
+    """Collects the attention of each encoder layer that runs meanwhile, in order."""
+    found: list[Any] = []
+
+    # An encoder layer asks its attention for no weights; with hooks on it, it also
+    # leaves the fused path, which would pass the attention module by.
+    def ask(module: nn.Module, args: Any, kwargs: dict[str, Any]) -> Any:
+        return args, {**kwargs, "need_weights": True, "average_attn_weights": True}
+
+    def keep(module: nn.Module, args: Any, output: Any) -> None:
+        found.append(output[1])
+
+    hooks = []
+    for layer in layers:
+        hooks.append(layer.self_attn.register_forward_pre_hook(ask, with_kwargs=True))
+        hooks.append(layer.self_attn.register_forward_hook(keep))
+    try:
+        yield found
+    finally:
+        for hook in hooks:
+            hook.remove()
+    given = sum(weights is not None for weights in found)
+    if not given or given != len(layers):
+        raise RuntimeError(
+            f"{given} of {len(layers)} encoder layers gave their attention: the layers "
+            "must be nn.TransformerEncoderLayer with nn.MultiheadAttention"
+        )
