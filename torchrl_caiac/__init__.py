@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.transforms import CAIACTransform
+from torchrl_caiac.transforms import CAIACTransform, CoDATransform
 
-__all__ = ["CAIACTransform", "EntityLayout"]
+__all__ = ["CAIACTransform", "CoDATransform", "EntityLayout"]
 
 __version__ = "0.1.0"

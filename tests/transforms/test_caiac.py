@@ -488,6 +488,36 @@ def test_rewards_from_observation_columns() -> None:
     assert torch.equal(out["next", "reward"][:, 0], wanted.sum(-1))
 
 
+def test_rewards_of_goals_that_are_subtensordicts() -> None:
+    layout = EntityLayout.from_keys(
+        {"box": ("s", "box"), "cup": ("s", "cup")},
+        goal={"cup": ("g", "cup"), "box": ("g", "box")},
+        achieved={"cup": ("s", "cup"), "box": ("s", "box")},
+    )
+    column = torch.arange(6.0)
+
+    def state(sign: int) -> dict:
+        cup = {"z": sign * column, "a": sign * column.view(6, 1, 1) - 1}
+        return {"box": sign * column, "cup": cup}
+
+    td = TensorDict(
+        {
+            "s": state(1),
+            "g": state(-1),
+            "next": {"s": state(1), "reward": torch.zeros(6, 1)},
+            ("caiac", "score"): torch.zeros(6, 2),
+        },
+        [6],
+    )
+    out = CAIACTransform(
+        layout, counterfactual_ratio=1.0, reward_fn=lambda a, d: a[:, 0] - d[:, 2]
+    )(td)
+    # in layout order: the box, then the cup's a and z
+    wanted = out["next", "s", "box"] - out["g", "cup", "z"]
+    assert torch.equal(out["next", "reward"][:, 0], wanted)
+    assert (out["s", "box"] != column).all()
+
+
 def test_reward_errors() -> None:
     td = small(batch=4).sample()
     with pytest.raises(ValueError, match=r"reward_fn returned \[\].*wanted \[2\]"):

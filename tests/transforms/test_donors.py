@@ -14,6 +14,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorStorage
 from torchrl_caiac.transforms import donors as module
 from torchrl_caiac.transforms.donors import (
     TrajectoryIndex,
+    call_reward,
     draw_batch_donors,
     draw_buffer_donors,
     eligible_starts,
@@ -200,3 +201,17 @@ def test_buffer_donors_are_uniform() -> None:
         assert share[begin:end].sum() == pytest.approx(1.0)
         assert (share[begin:end] - 1 / (end - begin)).abs().max() < 0.01
     assert draw.swapped.all() and not draw.no_donor.any()
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 1)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
+def test_call_reward(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    like = torch.zeros(shape, dtype=dtype)
+    goals = torch.arange(8.0).view(4, 2)
+    for out in (goals[:, 1], goals[:, 1:], goals[:, 1] > 3):
+        found = call_reward(lambda a, d, out=out: out, goals, goals, like)
+        assert found.shape == like.shape and found.dtype == dtype
+        assert found.flatten().tolist() == out.flatten().tolist()
+    for wrong in (goals, goals[:2], 1.0):
+        with pytest.raises(ValueError, match=r"reward_fn returned .*wanted \[4\]"):
+            call_reward(lambda a, d, wrong=wrong: wrong, goals, goals, like)

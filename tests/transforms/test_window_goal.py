@@ -1,4 +1,4 @@
-"""WindowGoal: draws, reading, and the way through a replay buffer."""
+"""WindowGoal: reading, and the way through a replay buffer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from torchrl.data import (
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.transforms import CAIACTransform, WindowGoal
-from torchrl_caiac.transforms.window_goal import draw_goal_offset
 
 LAYOUT = EntityLayout(
     {"arm": [0], "cup": [1, 2]},
@@ -93,56 +92,6 @@ def buffer(
     for begin in range(0, len(data), 3):
         rb.extend(data[begin : begin + 3])
     return rb
-
-
-# --- draws ---------------------------------------------------------------------------
-
-
-@given(
-    remaining=st.lists(st.integers(0, 50), min_size=1, max_size=20),
-    weights=st.tuples(*[st.floats(0, 3)] * 3).filter(lambda w: sum(w) > 0.01),
-    p=st.floats(0.01, 1.0),
-    seed=st.integers(0, 2**31),
-)
-@settings(deadline=None)
-def test_offsets_stay_in_the_trajectory(remaining, weights, p, seed) -> None:
-    mixture = dict(zip(("last", "uniform", "geometric"), weights, strict=True))
-    left = torch.tensor(remaining)
-    drawn = [
-        draw_goal_offset(
-            left, mixture, p=p, generator=torch.Generator().manual_seed(seed)
-        )
-        for _ in range(2)
-    ]
-    assert torch.equal(*drawn)
-    assert ((drawn[0] >= 0) & (drawn[0] <= left)).all()
-    if mixture["uniform"] == mixture["geometric"] == 0:
-        assert torch.equal(drawn[0], left)
-
-
-def shares(mixture: dict[str, float], left: int, p: float = 0.3) -> torch.Tensor:
-    drawn = draw_goal_offset(
-        torch.full((200_000,), left),
-        mixture,
-        p=p,
-        generator=torch.Generator().manual_seed(0),
-    )
-    return torch.bincount(drawn, minlength=left + 1) / 200_000
-
-
-def test_distributions() -> None:
-    left, p = 6, 0.3
-    uniform = torch.full((7,), 1 / 7)
-    geometric = torch.tensor([p * (1 - p) ** k for k in range(7)])
-    geometric[-1] += 1 - geometric.sum()  # clipped to the last state
-    last = torch.zeros(7)
-    last[-1] = 1.0
-    assert (shares({"uniform": 2.0}, left) - uniform).abs().max() < 0.004
-    assert (shares({"geometric": 0.1}, left, p) - geometric).abs().max() < 0.004
-    mixed = 0.5 * last + 0.3 * geometric + 0.2 * uniform
-    drawn = shares({"last": 5, "geometric": 3, "uniform": 2}, left, p)
-    assert (drawn - mixed).abs().max() < 0.004
-    assert shares({"geometric": 1.0}, left, 1.0)[0] == 1.0
 
 
 # --- through a buffer ----------------------------------------------------------------

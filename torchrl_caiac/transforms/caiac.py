@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from typing import Any
-
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
-from torchrl.envs.transforms import Transform
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 from torchrl_caiac.transforms.donors import (
-    BufferDonors,
+    RewardFn,
     SwapDraw,
-    apply_swap,
     draw_batch_donors,
-    recompute_reward,
     uninfluenced,
 )
 from torchrl_caiac.transforms.window_goal import WindowGoal
 
 __all__ = ["CAIACTransform"]
 
-RewardFn = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
-
-class CAIACTransform(Transform):
+class CAIACTransform(CounterfactualTransform):
     """Swaps entities that the agent does not influence with those of other samples.
 
     Appended to a replay buffer whose rows carry scores (see
@@ -86,6 +77,10 @@ class CAIACTransform(Transform):
         counterfactual_key (NestedKey): see above. Defaults to
             ``("caiac", "counterfactual")``.
         swapped_key (NestedKey): see above. Defaults to ``("caiac", "swapped")``.
+        relabeled_key (NestedKey): the mark of a
+            :class:`~torchrl_caiac.transforms.HindsightGoal` that was appended before,
+            whose relabelling is done after the swap then. Defaults to
+            ``("hindsight", "relabeled")``.
         trajectory_key (NestedKey): trajectory ids, to check that windows do not cross
             trajectories and to find donor windows. Defaults to ``"episode"``.
         done_key (NestedKey): end flags, read where there are no ids. Defaults to
@@ -138,117 +133,32 @@ class CAIACTransform(Transform):
         generator: torch.Generator | None = None,
         counterfactual_key: NestedKey = ("caiac", "counterfactual"),
         swapped_key: NestedKey = ("caiac", "swapped"),
+        relabeled_key: NestedKey = ("hindsight", "relabeled"),
         trajectory_key: NestedKey = "episode",
         done_key: NestedKey = ("next", "done"),
         check: bool = True,
     ) -> None:
-        super().__init__()
-        if not isinstance(layout, EntityLayout):
-            raise TypeError(f"layout is an EntityLayout, got {type(layout).__name__}")
-        self.layout = layout
-        self.threshold = _number("threshold", threshold, math.inf)
-        self.counterfactual_ratio = _number(
-            "counterfactual_ratio", counterfactual_ratio, 1.0
+        super().__init__(
+            layout,
+            threshold=threshold,
+            counterfactual_ratio=counterfactual_ratio,
+            swap_prob=swap_prob,
+            window=window,
+            donors=donors,
+            score_key=score_key,
+            reward_fn=reward_fn,
+            reward_key=reward_key,
+            goals=goals,
+            generator=generator,
+            counterfactual_key=counterfactual_key,
+            swapped_key=swapped_key,
+            relabeled_key=relabeled_key,
+            trajectory_key=trajectory_key,
+            done_key=done_key,
+            check=check,
         )
-        self.swap_prob = _number("swap_prob", swap_prob, 1.0)
-        if isinstance(window, bool) or not isinstance(window, int):
-            raise TypeError(f"window is a number of rows, an int; got {window!r}")
-        if window < 1:
-            raise ValueError(f"window is at least 1 row, got {window}")
-        if reward_fn is not None and not callable(reward_fn):
-            raise TypeError(
-                "reward_fn is a function of the next achieved and the desired goals, "
-                f"got {type(reward_fn).__name__}"
-            )
-        if generator is not None and not isinstance(generator, torch.Generator):
-            raise TypeError(
-                f"generator is a torch.Generator, got {type(generator).__name__}"
-            )
-        if goals is not None:
-            if not isinstance(goals, WindowGoal):
-                raise TypeError(f"goals is a WindowGoal, got {type(goals).__name__}")
-            if donors is None:
-                raise ValueError(
-                    "goals draws the goals of donor windows of a donor buffer, and "
-                    "there is none: donors in the batch bring their goals with them"
-                )
-            if goals.window != window or goals.layout != layout:
-                raise ValueError(
-                    f"goals has window {goals.window} and its own layout, the "
-                    f"transform has window {window}: both must be the same"
-                )
-        self.window = window
-        self.score_key = unravel_key(score_key)
-        self.reward_fn = reward_fn
-        self.reward_key = unravel_key(reward_key)
-        self.generator = generator
-        self.counterfactual_key = unravel_key(counterfactual_key)
-        self.swapped_key = unravel_key(swapped_key)
-        self.trajectory_key = unravel_key(trajectory_key)
-        self.done_key = unravel_key(done_key)
-        self.check = bool(check)
-        # In a tuple, so that torch does not take goals for a submodule.
-        self._donors: tuple[BufferDonors, ...] = ()
-        if donors is not None:
-            self._donors = (
-                BufferDonors(
-                    donors,
-                    layout,
-                    threshold=self.threshold,
-                    window=window,
-                    score_key=self.score_key,
-                    trajectory_key=self.trajectory_key,
-                    done_key=self.done_key,
-                    goals=goals,
-                ),
-            )
-        self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
         self._any_fixed = bool(layout.fixed)
         self._swappable = ~layout.fixed_mask
-
-    # --- settings and state ----------------------------------------------------------
-
-    @property
-    def donors(self) -> ReplayBuffer | TensorStorage | None:
-        """Where donors are drawn; ``None`` for the batch."""
-        return self._donors[0].donors if self._donors else None
-
-    @property
-    def no_donor_count(self) -> torch.Tensor:
-        """How often each entity should have been swapped and had no donor.
-
-        int64 ``[N]``, in windows, since the transform was made or
-        :meth:`reset_no_donor_count` was called.
-        """
-        return self._no_donor.clone()
-
-    def reset_no_donor_count(self) -> None:
-        """Sets :attr:`no_donor_count` to zero."""
-        self._no_donor.zero_()
-
-    def set_generator(self, generator: torch.Generator | None) -> None:
-        """Sets the source of randomness.
-
-        Args:
-            generator (torch.Generator, optional): ``None`` for torch's default one.
-        """
-        self.generator = generator
-
-    def refresh_donors(self) -> None:
-        """Has the index of eligible donors built anew.
-
-        It is rebuilt after every write through the buffer or its storage; call this
-        after writing into the storage's raw tensors.
-        """
-        for donors in self._donors:
-            donors.refresh()
-
-    def share_memory_(self) -> CAIACTransform:
-        """Moves the counter to shared memory, for buffers used by several processes."""
-        self._no_donor.share_memory_()
-        return self
-
-    # --- the two halves of an augmentation -------------------------------------------
 
     def uninfluenced(self, scores: torch.Tensor) -> torch.Tensor:
         """The entities of each window that may be swapped (eq. 3.3 and 1).
@@ -266,248 +176,37 @@ class CAIACTransform(Transform):
             free = free & self._swappable
         return free
 
-    def num_counterfactual(self, windows: int) -> int:
-        """How many of the last windows of a batch become counterfactual.
+    def swappable(self, scores: torch.Tensor) -> torch.Tensor:
+        """The entities of each window that may be swapped, :meth:`uninfluenced`.
 
         Args:
-            windows (int): windows in the batch, ``B``.
+            scores (torch.Tensor): ``[B * window, N]``.
 
         Returns:
-            int: ``round(counterfactual_ratio * B)``.
+            torch.Tensor: bool ``[B, N]``.
         """
-        return round(self.counterfactual_ratio * windows)
+        return self.uninfluenced(scores)
 
-    def generate_parameters(
-        self, scores: torch.Tensor, generator: torch.Generator | None = None
+    def draw_in_batch(
+        self,
+        free: torch.Tensor,
+        num_counterfactual: int,
+        generator: torch.Generator | None,
     ) -> SwapDraw:
-        """Draws what is swapped, and with whom.
+        """Draws a donor for each entity, :func:`draw_batch_donors`.
 
         Args:
-            scores (torch.Tensor): the batch's scores ``[B * window, N]``.
-            generator (torch.Generator, optional): source of randomness; the
-                transform's own by default.
+            free (torch.Tensor): bool ``[B, N]``.
+            num_counterfactual (int): how many windows become counterfactual.
+            generator (torch.Generator, optional): source of randomness.
 
         Returns:
-            SwapDraw: the draw, for the last ``C`` windows.
+            SwapDraw: the draw.
         """
-        generator = self.generator if generator is None else generator
-        free = self.uninfluenced(scores)
-        count = self.num_counterfactual(free.shape[0])
-        if self._donors:
-            return self._donors[0].draw(
-                free[free.shape[0] - count :],
-                swap_prob=self.swap_prob,
-                generator=generator,
-            )
         return draw_batch_donors(
             free,
-            count,
+            num_counterfactual,
             window=self.window,
             swap_prob=self.swap_prob,
             generator=generator,
         )
-
-    def apply_parameters(
-        self, tensordict: TensorDictBase, draw: SwapDraw
-    ) -> TensorDictBase:
-        """Applies a draw: the same draw gives the same batch.
-
-        Args:
-            tensordict (TensorDictBase): the batch ``[B * window]``; it stays as it is.
-            draw (SwapDraw): from :meth:`generate_parameters`.
-
-        Returns:
-            TensorDictBase: the batch with counterfactual rows, and marked.
-        """
-        if self._donors:
-            out = self._donors[0].apply(tensordict, draw)
-        else:
-            out = apply_swap(tensordict, self.layout, draw, window=self.window)
-        changed = draw.swapped.shape[0] * self.window
-        if self.reward_fn is not None and changed:
-            reward = recompute_reward(
-                out, self.layout, self.reward_fn, changed, reward_key=self.reward_key
-            )
-            out.set(self.reward_key, reward)
-        total = tensordict.shape[0]
-        swapped = draw.swapped
-        if self.window > 1:
-            swapped = swapped.repeat_interleave(self.window, 0)
-        marks = swapped.new_zeros(total, swapped.shape[-1])
-        marks[total - changed :] = swapped
-        counterfactual = swapped.new_zeros(total, 1)
-        counterfactual[total - changed :] = True
-        out.set(self.counterfactual_key, counterfactual)
-        out.set(self.swapped_key, marks)
-        return out
-
-    # --- the transform ---------------------------------------------------------------
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Makes the last rows of a batch counterfactual.
-
-        Args:
-            tensordict (TensorDictBase): the batch ``[B * window]``, with scores.
-
-        Returns:
-            TensorDictBase: a shallow copy with new leaves; the input stays as it is.
-
-        Raises:
-            KeyError: scores, or a leaf that the layout names, are missing.
-            ValueError: the batch does not fit the layout or the window, or a value is
-                not finite.
-        """
-        scores = self._scores(tensordict)
-        draw = self.generate_parameters(scores)
-        out = self.apply_parameters(tensordict, draw)
-        if self.check:
-            self._check(tensordict, out, scores)
-        if self._no_donor.device != draw.no_donor.device:
-            self._no_donor = self._no_donor.to(draw.no_donor.device)
-        self._no_donor += draw.no_donor
-        return out
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # A row without a score of its own would keep that of the row it replaces.
-        if tensordict.get(self.score_key, None) is None:
-            nan = torch.full(
-                (*tensordict.batch_size, len(self.layout)),
-                math.nan,
-                device=tensordict.device,
-            )
-            tensordict.set(self.score_key, nan)
-        return tensordict
-
-    def _scores(self, td: TensorDictBase) -> torch.Tensor:
-        if td.ndim != 1 or not td.shape[0]:
-            raise ValueError(
-                f"the batch has shape {list(td.shape)}, wanted [B * window] with rows "
-                "in it: sample flat batches from a buffer that holds data (use "
-                "rb.storage[...] to read rows as they are stored)"
-            )
-        if td.shape[0] % self.window:
-            raise ValueError(
-                f"the batch has {td.shape[0]} rows, which windows of {self.window} do "
-                f"not divide: sample slices of this length, e.g. SliceSampler("
-                f"slice_len={self.window}), and a batch size that is a multiple of it"
-            )
-        scores = td.get(self.score_key, None)
-        if scores is None:
-            raise KeyError(
-                f"the batch has no scores in {self.score_key!r}: call score_buffer on "
-                "the replay buffer, or name their key by score_key"
-            )
-        wanted = (td.shape[0], len(self.layout))
-        if tuple(scores.shape) != wanted:
-            raise ValueError(
-                f"{self.score_key!r} has shape {list(scores.shape)}, wanted "
-                f"{list(wanted)}: one score for each of the entities "
-                f"{list(self.layout.names)}"
-            )
-        return scores
-
-    # --- checking --------------------------------------------------------------------
-
-    def _observed(self, td: TensorDictBase) -> list[tuple[Any, torch.Tensor]]:
-        found = []
-        for key in self.layout.in_keys:
-            for where in (key, self.layout.next(key)):
-                value = td.get(where)
-                if isinstance(value, torch.Tensor):
-                    found.append((where, value))
-                else:
-                    found += [
-                        ((where, *_path(below)), leaf)
-                        for below, leaf in value.items(True, True)
-                    ]
-        return [(where, leaf) for where, leaf in found if leaf.is_floating_point()]
-
-    def _check(
-        self, before: TensorDictBase, after: TensorDictBase, scores: torch.Tensor
-    ) -> None:
-        """Raises where values make no sense, with one look at the device."""
-        # A sum is finite if all its terms are (unless it overflows: looked at below).
-        finite = [leaf.sum() for _, leaf in self._observed(after)]
-        finite.append(scores.sum())
-        total = torch.stack([value.float() for value in finite]).sum()
-        ok = torch.isfinite(total)
-        crossing = self._crossing(before)
-        if crossing is not None:
-            ok = ok & ~crossing.any()
-        if not ok.item():
-            self._explain(after, scores, crossing)
-
-    def _crossing(self, td: TensorDictBase) -> torch.Tensor | None:
-        """Bool ``[B, window - 1]``: where a window goes over a trajectory's end."""
-        if self.window == 1:
-            return None
-        ids = td.get(self.trajectory_key, None)
-        if ids is not None:
-            ids = ids.reshape(-1, self.window)
-            return ids[:, 1:] != ids[:, :-1]
-        done = td.get(self.done_key, None)
-        return None if done is None else done.reshape(-1, self.window)[:, :-1].bool()
-
-    def _explain(
-        self,
-        after: TensorDictBase,
-        scores: torch.Tensor,
-        crossing: torch.Tensor | None,
-    ) -> None:
-        names = self.layout.names
-        nan, infinite = scores.isnan(), scores.isinf()
-        if nan.any():
-            rows = int(nan.any(1).sum())
-            who = [names[i] for i in nan.any(0).nonzero()[:, 0].tolist()]
-            raise ValueError(
-                f"{self.score_key!r} is NaN, that is not scored, in {rows} of "
-                f"{scores.shape[0]} rows for {who}: call score_buffer on the replay "
-                "buffer after extending it"
-            )
-        if infinite.any():
-            who = [names[i] for i in infinite.any(0).nonzero()[:, 0].tolist()]
-            raise ValueError(
-                f"{self.score_key!r} is infinite for {who}: check the influence "
-                "measure, then call score_buffer(..., overwrite=True)"
-            )
-        if crossing is not None and crossing.any():
-            window = int(crossing.any(1).nonzero()[0, 0])
-            raise ValueError(
-                f"window {window} of {self.window} rows crosses a trajectory's end: "
-                f"use SliceSampler with slice_len={self.window} and "
-                "strict_length=True, and trajectories of at least this length"
-            )
-        for key, leaf in self._observed(after):
-            bad = ~leaf.isfinite()
-            if bad.any():
-                row = int(bad.flatten(1).any(1).nonzero()[0, 0])
-                raise ValueError(
-                    f"{key!r} is not finite (NaN or infinite) in {int(bad.sum())} "
-                    f"values, first in row {row} of the batch: clean the data, or "
-                    "the donors' data"
-                )
-
-    def extra_repr(self) -> str:
-        """The arguments, for ``repr``."""
-        donors = f"{type(self.donors).__name__}" if self._donors else "the batch"
-        return (
-            f"threshold={self.threshold}, "
-            f"counterfactual_ratio={self.counterfactual_ratio}, "
-            f"swap_prob={self.swap_prob}, window={self.window}, donors={donors}"
-        )
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.extra_repr()})"
-
-
-def _number(name: str, value: Any, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{name} is a number, got {value!r}")
-    if not 0 <= value <= high or not math.isfinite(value):
-        limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"
-        raise ValueError(f"{name} is {limits}, got {value!r}")
-    return float(value)
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)

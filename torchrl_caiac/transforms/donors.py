@@ -8,16 +8,17 @@ ones of the batch), ``N`` the number of entities.
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
-from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.entities import EntityLayout, _flatten
 
 __all__ = [
     "BufferDonors",
@@ -25,13 +26,17 @@ __all__ = [
     "SwapDraw",
     "TrajectoryIndex",
     "apply_swap",
+    "call_reward",
     "draw_batch_donors",
     "draw_buffer_donors",
     "eligible_starts",
     "recompute_reward",
+    "stored_reward",
     "trajectory_index",
     "uninfluenced",
 ]
+
+RewardFn = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 # Rows of the storage that are looked at together while an index is built.
 _CHUNK = 1 << 20
@@ -433,6 +438,9 @@ class BufferDonors:
         goals (WindowGoal, optional): draws the goals of donor windows.
     """
 
+    _what: ClassVar[str] = "scores"
+    _key_argument: ClassVar[str] = "score_key"
+
     def __init__(
         self,
         donors: ReplayBuffer | TensorStorage,
@@ -458,7 +466,12 @@ class BufferDonors:
         self.trajectory_key = trajectory_key
         self.done_key = done_key
         self.goals = goals
-        self._built: tuple[Any, DonorIndex, TrajectoryIndex | None] | None = None
+        self._built: tuple[Any, Any, TrajectoryIndex | None] | None = None
+
+    @property
+    def feature_shape(self) -> tuple[int, ...]:
+        """The shape of one row's scores, ``(N,)``."""
+        return (len(self.layout),)
 
     @property
     def storage(self) -> TensorStorage:
@@ -472,7 +485,21 @@ class BufferDonors:
         """The storage's own tensordict, which may be longer than its content."""
         return _storage_td(self.storage, "the donor buffer")
 
-    def index(self) -> tuple[DonorIndex, TrajectoryIndex | None]:
+    def _eligible(
+        self, scores: torch.Tensor, trajectories: TrajectoryIndex | None
+    ) -> Any:
+        return eligible_starts(
+            scores,
+            self.threshold,
+            ~self.layout.fixed_mask.to(scores.device),
+            window=self.window,
+            trajectories=trajectories,
+        )
+
+    def _choose(self, free: torch.Tensor, index: Any, **kwargs: Any) -> SwapDraw:
+        return draw_buffer_donors(free, index, **kwargs)
+
+    def index(self) -> tuple[Any, TrajectoryIndex | None]:
         """The eligible windows, and the trajectories where they are needed.
 
         Raises:
@@ -487,15 +514,15 @@ class BufferDonors:
             scores = data.get(self.score_key, None)
             if scores is None:
                 raise KeyError(
-                    f"the donor buffer has no scores in {self.score_key!r}: call "
-                    "score_buffer on it, or name their key by score_key"
+                    f"the donor buffer has no {self._what} in {self.score_key!r}: call "
+                    f"score_buffer on it, or name their key by {self._key_argument}"
                 )
-            entities = len(self.layout)
-            if scores.ndim != 2 or scores.shape[-1] != entities:
+            wanted = (scores.shape[0], *self.feature_shape)
+            if tuple(scores.shape) != wanted:
                 raise ValueError(
                     f"the donor buffer's {self.score_key!r} has shape "
-                    f"{list(scores.shape)}, wanted [{scores.shape[0]}, {entities}] for "
-                    f"the entities {list(self.layout.names)}: its layout is another one"
+                    f"{list(scores.shape)}, wanted {list(wanted)} for the entities "
+                    f"{list(self.layout.names)}: its layout is another one"
                 )
             trajectories = None
             if self.window > 1 or self.goals is not None:
@@ -504,16 +531,8 @@ class BufferDonors:
                     trajectory_key=self.trajectory_key,
                     done_key=self.done_key,
                 )
-            scores = _plain(scores)[:length]
-            swappable = ~self.layout.fixed_mask.to(scores.device)
-            starts = eligible_starts(
-                scores,
-                self.threshold,
-                swappable,
-                window=self.window,
-                trajectories=trajectories,
-            )
-            self._built = (revision, starts, trajectories)
+            eligible = self._eligible(_plain(scores)[:length], trajectories)
+            self._built = (revision, eligible, trajectories)
         return self._built[1], self._built[2]
 
     def draw(
@@ -536,7 +555,7 @@ class BufferDonors:
             SwapDraw: donors and goals as rows of the donor storage.
         """
         index, trajectories = self.index()
-        draw = draw_buffer_donors(free, index, swap_prob=swap_prob, generator=generator)
+        draw = self._choose(free, index, swap_prob=swap_prob, generator=generator)
         if self.goals is None or trajectories is None:
             return draw
         last = (draw.donors + self.window - 1) % trajectories.length
@@ -894,7 +913,11 @@ def _goal_vectors(
             value = None if where is None else td.get(where, None)
             if value is None:
                 return None, None
-            parts.append(value[first:].flatten(1))
+            value = value[first:]
+            if isinstance(value, torch.Tensor):
+                parts.append(value.reshape(len(value), -1))
+            else:
+                parts.append(_flatten(value, 1))
     if not desired_parts:
         return None, None
     return torch.cat(achieved_parts, -1), torch.cat(desired_parts, -1)
@@ -903,7 +926,7 @@ def _goal_vectors(
 def recompute_reward(
     td: TensorDictBase,
     layout: EntityLayout,
-    reward_fn: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+    reward_fn: RewardFn,
     num_rows: int,
     *,
     reward_key: NestedKey = ("next", "reward"),
@@ -950,12 +973,7 @@ def recompute_reward(
         tensor([[ 0.],
                 [-2.]])
     """
-    reward = td.get(reward_key, None)
-    if reward is None:
-        raise KeyError(
-            f"reward_fn is given, but the batch has no {reward_key!r}: name the "
-            "rewards by reward_key"
-        )
+    reward = stored_reward(td, reward_key)
     first = reward.shape[0] - num_rows
     achieved, desired = _goal_vectors(td, layout, first)
     if achieved is None or desired is None:
@@ -965,12 +983,75 @@ def recompute_reward(
             f"{layout.desired_goal_key!r} and {layout.achieved_goal_key!r} (or its "
             "`goal` and `achieved` keys)"
         )
-    old = reward[first:]
-    new = reward_fn(achieved, desired)
-    if not isinstance(new, torch.Tensor) or new.numel() != old.numel():
-        shape = list(new.shape) if isinstance(new, torch.Tensor) else type(new).__name__
-        raise ValueError(
-            f"reward_fn returned {shape} for goals {list(achieved.shape)}, wanted "
-            f"[{num_rows}] or [{num_rows}, 1]"
+    new = call_reward(reward_fn, achieved, desired, reward[first:])
+    return torch.cat([reward[:first], new])
+
+
+def stored_reward(td: TensorDictBase, reward_key: NestedKey) -> torch.Tensor:
+    """The rewards of a batch.
+
+    Args:
+        td (TensorDictBase): the batch ``[B]``.
+        reward_key (NestedKey): the rewards.
+
+    Returns:
+        torch.Tensor: ``[B]`` or ``[B, 1]``.
+
+    Raises:
+        KeyError: there are none.
+        ValueError: there is not one for each row.
+    """
+    reward = td.get(reward_key, None)
+    if reward is None:
+        raise KeyError(
+            f"reward_fn is given, but the batch has no {reward_key!r}: name the "
+            "rewards by reward_key"
         )
-    return torch.cat([reward[:first], new.reshape(old.shape).to(reward)])
+    if reward.numel() != td.shape[0]:
+        raise ValueError(
+            f"{reward_key!r} has shape {list(reward.shape)}, wanted "
+            f"[{td.shape[0]}, 1]: one reward for each row"
+        )
+    return reward
+
+
+def call_reward(
+    reward_fn: RewardFn,
+    achieved: torch.Tensor,
+    desired: torch.Tensor,
+    like: torch.Tensor,
+) -> torch.Tensor:
+    """Calls a reward function, and gives its rewards the shape of stored ones.
+
+    Args:
+        reward_fn (callable): ``(next_achieved [B, G], desired [B, G])`` to rewards
+            ``[B]`` or ``[B, 1]``.
+        achieved (torch.Tensor): ``[B, G]``, the next achieved goals.
+        desired (torch.Tensor): ``[B, G]``.
+        like (torch.Tensor): rewards ``[B]`` or ``[B, 1]``.
+
+    Returns:
+        torch.Tensor: the rewards, shape, dtype and device of ``like``.
+
+    Raises:
+        ValueError: the function returned another number of rewards.
+    """
+    new = reward_fn(achieved, desired)
+    rows = achieved.shape[0]
+    shape = tuple(new.shape) if isinstance(new, torch.Tensor) else None
+    if shape not in ((rows,), (rows, 1)):
+        found = type(new).__name__ if shape is None else list(shape)
+        raise ValueError(
+            f"reward_fn returned {found} for goals {list(achieved.shape)}, wanted "
+            f"[{rows}] or [{rows}, 1]"
+        )
+    return new.reshape(like.shape).to(like)
+
+
+def _number(name: str, value: Any, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name} is a number, got {value!r}")
+    if not 0 <= value <= high or not math.isfinite(value):
+        limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"
+        raise ValueError(f"{name} is {limits}, got {value!r}")
+    return float(value)

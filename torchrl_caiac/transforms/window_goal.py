@@ -2,101 +2,23 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
-from torchrl.data import TensorStorage
-from torchrl.data.replay_buffers import SampleUnit
-from torchrl.envs.transforms import Transform
+from tensordict.utils import NestedKey
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.transforms.donors import (
-    StorageCache,
-    TrajectoryIndex,
-    _plain,
-    _rand,
-    _storage_td,
-    goal_columns,
-    trajectory_index,
-)
+from torchrl_caiac.transforms.donors import TrajectoryIndex, _plain, _storage_td
+from torchrl_caiac.transforms.future_goal import FutureGoal, _path, draw_goal_offset
 
-__all__ = ["WindowGoal", "draw_goal_offset"]
+__all__ = ["WindowGoal"]
 
 _STRATEGIES = ("last", "uniform", "geometric")
 
 
-def draw_goal_offset(
-    remaining: torch.Tensor,
-    mixture: Mapping[str, float],
-    *,
-    p: float = 0.3,
-    generator: torch.Generator | None = None,
-) -> torch.Tensor:
-    """Draws how many rows beyond a window the row lies whose next state is its goal.
-
-    Offset 0 is the window's last row, whose next state is the first one after the
-    window. Three strategies are mixed, window by window: ``last`` takes the
-    trajectory's last row, ``uniform`` any row from the window's last one on, and
-    ``geometric`` the state ``k >= 1`` steps after the window's last one with
-    probability ``p * (1 - p) ** (k - 1)``, or the last one if the trajectory ends
-    before.
-
-    Args:
-        remaining (torch.Tensor): int64 ``[*]``, rows of the trajectory after the
-            window.
-        mixture (mapping of str to float): the weight of each strategy.
-
-    Keyword Args:
-        p (float): the parameter of ``geometric``, in (0, 1]. Defaults to 0.3.
-        generator (torch.Generator, optional): source of randomness.
-
-    Returns:
-        torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.transforms.window_goal import draw_goal_offset
-        >>> draw_goal_offset(torch.tensor([4, 0]), {"last": 1.0})
-        tensor([4, 0])
-    """
-    weights = {name: weight for name, weight in mixture.items() if weight > 0}
-    shape, device = remaining.shape, remaining.device
-    chance = None
-    if set(weights) != {"last"}:
-        chance = _rand(
-            torch.rand, (2, *shape), device=device, generator=generator
-        ).double()
-    offset = remaining
-    below, total = 0.0, sum(weights.values())
-    for name, weight in weights.items():
-        if name == "last" or chance is None:
-            drawn = remaining
-        elif name == "uniform":
-            drawn = (chance[1] * (remaining + 1)).long()
-        else:
-            # Inverse of the distribution function, from u in [0, 1).
-            drawn = _geometric(chance[1], p)
-        drawn = torch.minimum(drawn, remaining)
-        if chance is None or below == 0.0:
-            offset = drawn
-        else:
-            offset = torch.where(chance[0] >= below / total, drawn, offset)
-        below += weight
-    return offset
-
-
-def _geometric(u: torch.Tensor, p: float) -> torch.Tensor:
-    if p >= 1.0:
-        return torch.zeros_like(u, dtype=torch.int64)
-    log = torch.log1p(torch.tensor(-p, dtype=torch.float64)).item()
-    return (torch.log1p(-u) / log).long()
-
-
-class WindowGoal(Transform, SampleUnit):
+class WindowGoal(FutureGoal):
     """Gives each window a goal: the goal achieved in a later state of its trajectory.
 
     One object does two things in a replay buffer. As its ``sample_unit`` it sees the
@@ -119,8 +41,8 @@ class WindowGoal(Transform, SampleUnit):
         window (int): rows a window, κ; 1 for transitions.
         mixture (mapping of str to float, optional): the weights of the strategies
             ``"last"``, ``"uniform"`` and ``"geometric"``, see
-            :func:`draw_goal_offset`. Defaults to half ``"last"``, half
-            ``"geometric"``.
+            :func:`~torchrl_caiac.transforms.future_goal.draw_goal_offset`. Defaults to
+            half ``"last"``, half ``"geometric"``.
         p (float): the parameter of ``"geometric"``. Defaults to 0.3.
         trajectory_key (NestedKey): trajectory ids in the storage. Defaults to
             ``"episode"``; without such a leaf, trajectories end at ``done_key``.
@@ -173,7 +95,14 @@ class WindowGoal(Transform, SampleUnit):
         generator: torch.Generator | None = None,
         counterfactual_key: NestedKey = ("caiac", "counterfactual"),
     ) -> None:
-        super().__init__()
+        super().__init__(
+            layout,
+            p=p,
+            trajectory_key=trajectory_key,
+            done_key=done_key,
+            counterfactual_key=counterfactual_key,
+            generator=generator,
+        )
         if mixture is None:
             mixture = {"last": 0.5, "geometric": 0.5}
         if isinstance(window, bool) or not isinstance(window, int) or window < 1:
@@ -192,50 +121,8 @@ class WindowGoal(Transform, SampleUnit):
                 "the weights of mixture are at least 0, finite, and not all 0; got "
                 f"{dict(mixture)}"
             )
-        if not 0 < p <= 1:
-            raise ValueError(f"p, of the geometric strategy, lies in (0, 1], got {p!r}")
-        if not any(layout.goal.values()):
-            raise ValueError(
-                "the layout has no goals: give EntityLayout(..., goal=..., "
-                "achieved=...)"
-            )
-        if not layout.is_flat:
-            blind = [
-                name
-                for name, key in layout.goal.items()
-                if key is not None and layout.achieved.get(name) is None
-            ]
-            if blind:
-                raise ValueError(
-                    f"the layout does not say where the achieved goals of {blind} lie: "
-                    "give EntityLayout.from_keys(..., achieved=...)"
-                )
-        self.layout = layout
         self.window = window
         self.mixture = dict(mixture)
-        self.p = float(p)
-        self.trajectory_key = unravel_key(trajectory_key)
-        self.done_key = unravel_key(done_key)
-        self.counterfactual_key = unravel_key(counterfactual_key)
-        self.generator = generator
-        self._reset_state()
-
-    def _reset_state(self) -> None:
-        self._pending = threading.local()
-        self._cache = StorageCache(self._trajectories)
-
-    def _trajectories(self, storage: TensorStorage) -> TrajectoryIndex:
-        return trajectory_index(
-            storage, trajectory_key=self.trajectory_key, done_key=self.done_key
-        )
-
-    def set_generator(self, generator: torch.Generator | None) -> None:
-        """Sets the source of randomness.
-
-        Args:
-            generator (torch.Generator, optional): ``None`` for torch's default one.
-        """
-        self.generator = generator
 
     # --- drawing ---------------------------------------------------------------------
 
@@ -319,66 +206,6 @@ class WindowGoal(Transform, SampleUnit):
         self._pending.goals = self.read_goals(data, goal_rows)
         return index, info
 
-    # --- reading ---------------------------------------------------------------------
-
-    def _flat_source(self, data: TensorDictBase) -> tuple[torch.Tensor, list[int]]:
-        layout = self.layout
-        if layout.achieved:
-            key: NestedKey = layout.next(layout.observation_key)
-            columns = goal_columns(layout)
-        else:
-            key = layout.next(layout.achieved_goal_key)
-            columns = list(range(layout.goal_width))
-        source = data.get(key, None)
-        if source is None:
-            raise KeyError(
-                f"goals are read from {key!r}, which the data lacks: give the layout "
-                "`achieved` columns, or store the achieved goals"
-            )
-        if source.shape[-1] <= max(columns):
-            raise ValueError(
-                f"{key!r} has {source.shape[-1]} columns, but the layout's goals need "
-                f"at least {max(columns) + 1}: correct the layout, or the data"
-            )
-        return _plain(source), columns
-
-    def read_goals(
-        self, data: TensorDictBase, rows: torch.Tensor
-    ) -> dict[NestedKey, torch.Tensor]:
-        """Reads the goals that the next states of rows achieve.
-
-        Args:
-            data (TensorDictBase): what ``rows`` are rows of, ``[T]``.
-            rows (torch.Tensor): int64 ``[M]``.
-
-        Returns:
-            dict: the goals ``[M, ...]`` by the desired-goal key they belong under.
-
-        Raises:
-            KeyError: the data lacks the leaf that goals are read from.
-        """
-        layout = self.layout
-        if layout.is_flat:
-            source, columns = self._flat_source(data)
-            where = layout._index_tensor("goal", columns, source.device)
-            goals = source[rows.to(source.device).unsqueeze(-1), where]
-            return {layout.desired_goal_key: goals}
-        found: dict[NestedKey, torch.Tensor] = {}
-        for name, key in layout.goal.items():
-            if key is not None:
-                found[key] = self._nested_source(data, name)[rows]
-        return found
-
-    def _nested_source(self, data: TensorDictBase, name: str) -> Any:
-        key = self.layout.next(self.layout.achieved[name])
-        source = data.get(key, None)
-        if source is None:
-            raise KeyError(
-                f"the goals of {name!r} are read from {key!r}, which the data lacks: "
-                "correct `achieved` in EntityLayout.from_keys"
-            )
-        return _plain(source) if isinstance(source, torch.Tensor) else source
-
     def donor_goals(
         self,
         donors: TensorDictBase,
@@ -459,29 +286,11 @@ class WindowGoal(Transform, SampleUnit):
         """The arguments, for ``repr``."""
         return f"window={self.window}, mixture={self.mixture}, p={self.p}"
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.extra_repr()})"
-
-    def clone(self) -> WindowGoal:
-        """A copy with its own pending goals."""
-        clone: WindowGoal = super().clone()
-        clone._reset_state()
-        return clone
-
-    def __getstate__(self) -> dict[str, Any]:
-        state: dict[str, Any] = super().__getstate__()
-        del state["_pending"], state["_cache"]
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._reset_state()
-
 
 def _below(key: NestedKey, *bases: NestedKey) -> tuple[str, ...]:
-    path = (key,) if isinstance(key, str) else tuple(key)
+    path = _path(key)
     for base in bases:
-        start = (base,) if isinstance(base, str) else tuple(base)
+        start = _path(base)
         if path[: len(start)] == start:
             return path[len(start) :]
     raise ValueError(f"{key!r} lies under none of {bases}")

@@ -1,0 +1,496 @@
+"""CoDATransform against a slow oracle, on the data of CAIACTransform's tests."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    SliceSampler,
+)
+
+from tests.transforms.test_caiac import (
+    FLAT,
+    FLAT_FREE,
+    NESTED,
+    STRIDE,
+    make_data,
+    owner_of,
+    time_order,
+)
+from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac.transforms import HindsightGoal, WindowGoal
+
+THRESHOLD = 0.25
+N = 3
+Window = tuple[int, ...]
+
+
+def with_graphs(data: TensorDict, share: float, generator: torch.Generator) -> Any:
+    """Adds graphs, each link on with some probability."""
+    graphs = torch.rand(len(data), N + 1, N, generator=generator)
+    off = torch.rand(graphs.shape, generator=generator) >= share
+    data["coda", "graph"] = torch.where(off, 0.0, graphs)
+    return data.exclude(("caiac", "score"))
+
+
+def free_components(layout: EntityLayout, graphs: torch.Tensor) -> list[frozenset[int]]:
+    """The components of a window ``[window, N + 1, N]`` that may be swapped."""
+    groups = [{i} for i in range(N + 1)]  # the last one is the action
+    for graph in graphs:
+        for i in range(N + 1):
+            for j in range(N):
+                if graph[i, j] > THRESHOLD:
+                    joined = next(g for g in groups if i in g) | next(
+                        g for g in groups if j in g
+                    )
+                    groups = [g for g in groups if not g & joined] + [joined]
+    never = {N, *(layout.index(name) for name in layout.fixed)}
+    return [frozenset(g) for g in groups if not g & never]
+
+
+def donor_windows(
+    rb: ReplayBuffer, layout: EntityLayout, window: int
+) -> dict[frozenset[int], set[Window]]:
+    """The row names of all windows that have each component, one by one."""
+    order, data, found = time_order(rb), rb.storage[:], {}
+    for start in range(len(order) - window + 1):
+        part = order[start : start + window]
+        if len({int(data["episode"][i]) for i in part}) == 1:
+            for component in free_components(layout, data["coda", "graph"][part]):
+                names = tuple(int(data["row"][i]) for i in part)
+                found.setdefault(component, set()).add(names)
+    return found
+
+
+@dataclass
+class Case:
+    layout: EntityLayout
+    rb: ReplayBuffer
+    donors: ReplayBuffer | None
+    window: int
+    ratio: float
+    swap_prob: float
+    transform: CoDATransform
+
+
+def origins(
+    case: Case, batch: TensorDict, stored: TensorDict, windows: int
+) -> dict[tuple[int, int], set[Window]]:
+    """Which windows the values of each entity come from, its own in the first place."""
+    found: dict[tuple[int, int], set[Window]] = {}
+    for key in stored.keys(True, True):
+        path = key if isinstance(key, tuple) else (key,)
+        value, real = batch[key], stored[key]
+        assert value.dtype == real.dtype and value.shape == real.shape
+        owner = owner_of(case.layout, path)
+        if owner is None:
+            assert torch.equal(value, real), key
+            continue
+        value, real = (x.reshape(len(x), -1).double() for x in (value, real))
+        if path[0] == "next":
+            value, real = -value - 1, -real - 1
+        assert torch.equal(value % STRIDE, real % STRIDE), key  # of the same column
+        rows = (value // STRIDE).long().unflatten(0, (windows, case.window))
+        for column in range(value.shape[1]):
+            name = owner if isinstance(owner, str) else owner[column]
+            if name is None:
+                assert torch.equal(value[:, column], real[:, column])
+                continue
+            for b in range(windows):
+                origin = tuple(rows[b, :, column].tolist())
+                found.setdefault((b, case.layout.index(name)), set()).add(origin)
+    return found
+
+
+def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> None:
+    """Raises where the batch is anything that section 3's invariants forbid."""
+    layout, window = case.layout, case.window
+    windows = len(batch) // window
+    first = windows - round(case.ratio * windows)
+    raw = case.rb.storage[:]
+    place = {int(row): i for i, row in enumerate(raw["row"])}
+    stored = raw[torch.tensor([place[row] for row in batch["row"].tolist()])]
+    names = [tuple(part) for part in batch["row"].unflatten(0, (-1, window)).tolist()]
+    graphs = stored["coda", "graph"].unflatten(0, (windows, window))
+    free = [free_components(layout, part) for part in graphs]
+    marked = batch["caiac", "counterfactual"].reshape(windows, window)
+    assert marked.tolist() == [[b >= first] * window for b in range(windows)]
+    marks = batch["caiac", "swapped"].unflatten(0, (windows, window))
+    assert marks.shape == (windows, window, N)
+    assert torch.equal(marks, marks[:, :1].expand_as(marks))
+    found = origins(case, batch, stored, windows)
+    allowed = (
+        None if case.donors is None else donor_windows(case.donors, layout, window)
+    )
+    for b in range(windows):
+        swapped = {n for n in range(N) if marks[b, 0, n]}
+        for n in set(range(N)) - swapped:
+            assert found.get((b, n), {names[b]}) == {names[b]}
+        if b < first:
+            assert not swapped
+            continue
+        for component in free[b]:
+            options = (
+                {names[c] for c in range(windows) if c != b and component in free[c]}
+                if allowed is None
+                else allowed.get(component, set())
+            )
+            if not options:
+                for n in component:
+                    missing[n] += case.swap_prob == 1.0
+            # A component is swapped whole or not at all, and from one window.
+            done = component & swapped
+            assert done == component or not done
+            assert bool(done) <= bool(options)
+            if options and case.swap_prob == 1.0:
+                assert done
+            if done:
+                sources = set.union(*(found.get((b, n), set()) for n in component))
+                assert len(sources) == 1 and sources <= options
+            swapped -= component
+        assert not swapped
+
+
+lengths = st.lists(st.integers(1, 9), min_size=1, max_size=4)
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    window = draw(st.integers(1, 4))
+    layout = draw(st.sampled_from([FLAT, FLAT_FREE, NESTED]))
+    dtype = draw(st.sampled_from([torch.float32, torch.float64, torch.int64]))
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+    share = draw(st.sampled_from([0.0, 0.05, 0.3]))
+
+    def buffer(offset: int, **kwargs: Any) -> ReplayBuffer:
+        parts = [*draw(lengths), draw(st.integers(window, window + 4))]
+        rows = offset + torch.arange(sum(parts))
+        goals = layout is not FLAT_FREE
+        data = make_data(layout, rows, parts, generator, dtype, goals)
+        data = with_graphs(data, share, generator)
+        # a storage smaller than the data is a ring that was written past its end
+        least = max(window, sum(parts) // 2)
+        size = draw(st.integers(least, sum(parts) + 2))
+        storage = draw(st.sampled_from([LazyTensorStorage, LazyMemmapStorage]))
+        rb = ReplayBuffer(storage=storage(size), **kwargs)
+        for begin in range(0, len(data), least):
+            rb.extend(data[begin : begin + least])
+        return rb
+
+    batch = draw(st.integers(1, 8))
+    rb = buffer(
+        0,
+        batch_size=batch * window,
+        sampler=None
+        if window == 1
+        else SliceSampler(slice_len=window, traj_key="episode"),
+    )
+    rb.set_rng(generator)  # a failure can be repeated
+    donors = buffer(STRIDE, batch_size=1) if draw(st.booleans()) else None
+    ratio = draw(st.sampled_from([0.0, 0.3, 0.5, 1.0]))
+    swap_prob = draw(st.sampled_from([0.0, 0.5, 1.0]))
+    transform = CoDATransform(
+        layout,
+        THRESHOLD,
+        ratio,
+        window,
+        donors,
+        swap_prob=swap_prob,
+        generator=generator,
+    )
+    return Case(layout, rb, donors, window, ratio, swap_prob, transform)
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@given(case=cases())
+def test_invariants(case: Case) -> None:
+    order, data = time_order(case.rb), case.rb.storage[:]
+    if not any(
+        len(set(data["episode"][order[s : s + case.window]].tolist())) == 1
+        for s in range(len(order) - case.window + 1)
+    ):
+        return  # the ring left no trajectory as long as the window
+    before = data.clone()
+    others = None if case.donors is None else case.donors.storage[:].clone()
+    case.rb.append_transform(case.transform)
+    missing = [0] * N
+    for _ in range(2):
+        check_batch(case, case.rb.sample(), missing)
+    if case.swap_prob == 1.0:
+        assert case.transform.no_donor_count.tolist() == missing
+    assert (case.rb.storage[:] == before).all()
+    if case.donors is not None:
+        assert (case.donors.storage[:] == others).all()
+
+
+# --- small fixed data ----------------------------------------------------------------
+
+
+def small(
+    layout: EntityLayout = FLAT, batch: int = 8, share: float = 0.0, window: int = 1
+) -> ReplayBuffer:
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.arange(20)
+    data = make_data(layout, rows, [10, 10], generator, goals=layout is not FLAT_FREE)
+    sampler = (
+        None if window == 1 else SliceSampler(slice_len=window, traj_key="episode")
+    )
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(20), sampler=sampler, batch_size=batch * window
+    )
+    rb.extend(with_graphs(data, share, generator))
+    return rb
+
+
+@pytest.mark.parametrize("donor", [False, True])
+def test_same_generator_state_gives_the_same_batch(donor: bool) -> None:
+    batches = []
+    for _ in range(2):
+        rb = small(share=0.1)
+        rb.set_rng(torch.Generator().manual_seed(5))
+        transform = CoDATransform(
+            FLAT, swap_prob=0.5, donors=small(share=0.1) if donor else None
+        )
+        transform.set_generator(torch.Generator().manual_seed(3))
+        rb.append_transform(transform)
+        batches.append([rb.sample() for _ in range(3)])
+    for one, other in zip(*batches, strict=True):
+        assert (one == other).all()
+
+
+def test_draw_and_apply_are_apart() -> None:
+    td = small(batch=6).sample()
+    transform = CoDATransform(FLAT, counterfactual_ratio=1.0)
+    draw = transform.generate_parameters(td["coda", "graph"])
+    assert draw.donors.shape == draw.swapped.shape == (6, N)
+    one = transform.apply_parameters(td, draw)
+    assert (transform.apply_parameters(td, draw) == one).all()
+
+
+def test_without_links_it_is_caiac() -> None:
+    """Nothing but the action's links: both transforms may do the same."""
+    rb = small(FLAT_FREE, batch=50)
+    td = rb.sample()
+    td["coda", "graph"][:, N] = torch.rand(50, N)
+    td["action score"] = td["coda", "graph"][:, N]
+    coda = CoDATransform(FLAT_FREE, 0.4)(td)
+    caiac = CAIACTransform(FLAT_FREE, 0.4, score_key="action score")(td)
+    for key in ("counterfactual", "swapped"):
+        assert torch.equal(coda["caiac", key], caiac["caiac", key])
+
+
+def test_nested_keys_and_options() -> None:
+    rb = small(NESTED)
+    td = rb.sample().rename_key_(("coda", "graph"), ("my", "own", "graph"))
+    transform = CoDATransform(
+        NESTED,
+        graph_key=("my", "own", "graph"),
+        counterfactual_key=("marks", "row"),
+        swapped_key="swaps",
+        reward_fn=lambda achieved, desired: achieved.sum(-1),
+    )
+    assert transform.graph_key == ("my", "own", "graph")
+    out = transform(td)
+    assert out["marks", "row"].sum() == 4 and out["swaps"][4:, 1:].all()
+    swapped = out["next", "got", "cup"][4:].sum(-1, keepdim=True)
+    assert torch.equal(out["next", "reward"][4:], swapped)
+    assert torch.equal(out["next", "reward"][:4], td["next", "reward"][:4])
+    assert ("caiac", "swapped") not in out.keys(True, True)
+    assert "threshold=0.2" in repr(transform) and "CoDATransform" in repr(transform)
+
+
+def test_entities_of_a_component_share_the_goal_of_their_donor() -> None:
+    layout = EntityLayout(
+        {"cup": [0], "lid": [1]},
+        goal={"cup": [0], "lid": [1]},
+        achieved={"cup": [0], "lid": [1]},
+    )
+    state = torch.arange(100.0).unsqueeze(-1).expand(100, 2).clone()
+    graph = torch.zeros(100, 3, 2)
+    graph[:, 0, 1] = 1.0
+    data = TensorDict(
+        {
+            "observation": state,
+            "next": {"observation": state + 1},
+            "episode": torch.arange(100) // 50,
+            "desired_goal": torch.zeros(100, 2),
+            ("coda", "graph"): graph,
+        },
+        [100],
+    )
+    donors = ReplayBuffer(storage=LazyTensorStorage(100))
+    donors.extend(data)
+    goals = WindowGoal(layout, window=2, mixture={"geometric": 1.0}, p=0.1)
+    transform = CoDATransform(layout, 0.2, 1.0, 2, donors, goals=goals)
+    out = transform(data[:20])
+    assert out["caiac", "swapped"].all()
+    for key in ("observation", "desired_goal"):
+        assert torch.equal(out[key][:, 0], out[key][:, 1])
+    ahead = out["desired_goal"] - out["observation"]
+    assert (ahead.view(10, 2, 2)[:, 1] >= 1).all() and len(ahead.unique()) > 3
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_with_hindsight_goals(early: bool) -> None:
+    def reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+        return -(achieved != desired).any(-1).float()
+
+    rb = small(FLAT)
+    goals = HindsightGoal(FLAT, reward, future=0.0, counterfactual=1.0)
+    coda = CoDATransform(FLAT)
+    for transform in (goals, coda) if early else (coda, goals):
+        rb.append_transform(transform)
+    batch = rb.sample()
+    assert batch["caiac", "swapped"][4:, 1:].all()
+    assert (
+        batch["hindsight", "relabeled"].flatten().tolist() == [False] * 4 + [True] * 4
+    )
+    achieved = batch["next", "observation"][4:, [7, 1, 2]]  # as `achieved` names them
+    wanted = batch["desired_goal"][4:, [1, 2, 0]]
+    for goal in wanted:
+        assert (achieved == goal).all(-1).any()
+
+
+def test_rows_written_later_are_not_scored() -> None:
+    rb = small()
+    rb.append_transform(CoDATransform(FLAT, 1.0))
+    rb.extend(rb.storage[:3].clone().exclude(("coda", "graph")))
+    assert int(rb.storage[:]["coda", "graph"].isnan().flatten(1).all(1).sum()) == 3
+    with pytest.raises(ValueError, match=r"'graph'\) is NaN, that is not scored, in 3"):
+        rb[:]
+
+
+def test_the_index_of_donors_follows_writes() -> None:
+    donors, td = small(), small().sample()
+    transform = CoDATransform(FLAT, 1.5, 1.0, donors=donors)
+    assert transform(td)["caiac", "swapped"][:, 1:].all()
+    held = donors.storage[:].clone()
+    held["coda", "graph"].fill_(2.0)
+    donors.extend(held)
+    assert not transform(td)["caiac", "swapped"].any()
+    donors.storage[:]["coda", "graph"].zero_()  # behind the buffer's back
+    assert not transform(td)["caiac", "swapped"].any()
+    transform.refresh_donors()
+    assert transform(td)["caiac", "swapped"][:, 1:].all()
+    assert transform.no_donor_count.tolist() == [0, 16, 16]
+    transform.reset_no_donor_count()
+    assert transform.no_donor_count.sum() == 0
+
+
+def test_copies_and_pickles() -> None:
+    transform = CoDATransform(FLAT, 0.3, donors=small(), window=2)
+    td = small(window=2).sample()
+    for twin in (copy.deepcopy(transform), pickle.loads(pickle.dumps(transform))):
+        torch.manual_seed(0)
+        one = transform(td)
+        torch.manual_seed(0)
+        assert (twin(td) == one).all()
+
+
+# --- bad input -----------------------------------------------------------------------
+
+
+def layout_of(entities: int) -> EntityLayout:
+    return EntityLayout({f"e{i}": [i] for i in range(entities)})
+
+
+def test_at_most_64_entities() -> None:
+    with pytest.raises(
+        ValueError, match=r"the layout has 65 entities, but.*at most 64"
+    ):
+        CoDATransform(layout_of(65))
+    layout = layout_of(64)
+    state = torch.arange(4.0).unsqueeze(-1).expand(4, 64)
+    graph = torch.zeros(4, 65, 64)
+    graph[:, 0, 63] = graph[:, 64, 5] = 1.0
+    td = TensorDict(
+        {
+            "observation": state,
+            "next": {"observation": state},
+            ("coda", "graph"): graph,
+        },
+        [4],
+    )
+    out = CoDATransform(layout)(td)
+    swapped = out["caiac", "swapped"]
+    assert swapped[2:].sum(1).tolist() == [63, 63] and not swapped[:, 5].any()
+    assert torch.equal(out["observation"][:, 0], out["observation"][:, 63])
+
+
+def test_graphs_of_the_wrong_shape() -> None:
+    td = small().sample()
+    graph = td["coda", "graph"]
+    message = r"wanted \[8, 4, 3\]: a score from each entity and the action to each of"
+    for wrong in (graph[:, :N], graph.mT, graph[:, N], graph[..., None]):
+        with pytest.raises(ValueError, match=message):
+            CoDATransform(FLAT)(td.copy().set(("coda", "graph"), wrong))
+    with pytest.raises(KeyError, match=r"no graphs in.*name their key by graph_key"):
+        CoDATransform(FLAT)(td.exclude(("coda", "graph")))
+    donors = small()
+    transform = CoDATransform(FLAT, donors=donors, graph_key="other")
+    with pytest.raises(
+        KeyError, match=r"donor buffer has no graphs in 'other'.*graph_"
+    ):
+        transform(td.copy().set("other", graph))
+    donors.storage._storage["other"] = torch.zeros(20, N, N)
+    donors.storage._bump_mutation_revision()
+    with pytest.raises(ValueError, match=r"shape \[20, 3, 3\], wanted \[20, 4, 3\]"):
+        transform(td.copy().set("other", graph))
+
+
+def test_graphs_that_are_not_finite() -> None:
+    td = small().sample()
+    td["coda", "graph"][2, 3, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"is NaN.*in 1 of 8 rows for \['cup'\]"):
+        CoDATransform(FLAT)(td)
+    out = CoDATransform(FLAT, 1.5, 1.0, check=False)(td)
+    # Unscored is linked: to the action here.
+    assert not out["caiac", "swapped"][2, 1] and out["caiac", "swapped"][2, 2]
+    td["coda", "graph"][2, 3, 1] = torch.inf
+    with pytest.raises(ValueError, match=r"infinite for \['cup'\]"):
+        CoDATransform(FLAT)(td)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"threshold": -0.1}, ValueError, "threshold is finite, at least 0"),
+        ({"counterfactual_ratio": 2}, ValueError, "counterfactual_ratio is in"),
+        ({"swap_prob": "1"}, TypeError, "swap_prob is a number"),
+        ({"window": 0}, ValueError, "window is at least 1 row"),
+        ({"donors": [1]}, TypeError, "donors is a ReplayBuffer"),
+        ({"goals": WindowGoal(FLAT, 1)}, ValueError, "there is none"),
+        ({"generator": 1}, TypeError, "generator is a torch.Generator"),
+    ],
+)
+def test_wrong_arguments(kwargs: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        CoDATransform(FLAT, **kwargs)
+
+
+@pytest.mark.gpu
+def test_on_an_accelerator() -> None:
+    td = small(batch=200, share=0.1).sample().to("cuda")
+    transform = CoDATransform(FLAT, 0.25, 1.0)
+    out = transform(td)
+    masks = transform.swappable(td["coda", "graph"])
+    assert torch.equal(masks.cpu(), transform.swappable(td["coda", "graph"].cpu()))
+    assert not (out["caiac", "swapped"] & (masks == 0)).any()
+    assert out["caiac", "swapped"].any() and out["observation"].is_cuda
+    donors = CoDATransform(FLAT, 0.25, 1.0, donors=small(share=0.1))(td)
+    assert donors["caiac", "swapped"].any()

@@ -1,0 +1,115 @@
+"""What all goals share: offsets, and reading goals from data of any form."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.transforms import HindsightGoal, WindowGoal
+from torchrl_caiac.transforms.future_goal import FutureGoal, draw_goal_offset
+
+FLAT = EntityLayout(
+    {"arm": [0], "cup": [3, 1]},
+    goal={"cup": [1, 0]},
+    achieved={"cup": [1, 3]},
+    fixed=["arm"],
+)
+NESTED = EntityLayout.from_keys(
+    {"lid": "lid", "cup": "cup"},
+    goal={"cup": ("goal", "cup"), "lid": "lid_goal"},
+    achieved={"cup": "cup", "lid": "lid"},
+)
+
+
+# --- draws ---------------------------------------------------------------------------
+
+
+@given(
+    remaining=st.lists(st.integers(0, 50), min_size=1, max_size=20),
+    weights=st.tuples(*[st.floats(0, 3)] * 3).filter(lambda w: sum(w) > 0.01),
+    p=st.floats(0.01, 1.0),
+    seed=st.integers(0, 2**31),
+)
+def test_offsets_stay_in_the_trajectory(remaining, weights, p, seed) -> None:
+    mixture = dict(zip(("last", "uniform", "geometric"), weights, strict=True))
+    left = torch.tensor(remaining)
+    drawn = [
+        draw_goal_offset(
+            left, mixture, p=p, generator=torch.Generator().manual_seed(seed)
+        )
+        for _ in range(2)
+    ]
+    assert torch.equal(*drawn)
+    assert ((drawn[0] >= 0) & (drawn[0] <= left)).all()
+    if mixture["uniform"] == mixture["geometric"] == 0:
+        assert torch.equal(drawn[0], left)
+
+
+def shares(mixture: dict[str, float], left: int, p: float = 0.3) -> torch.Tensor:
+    drawn = draw_goal_offset(
+        torch.full((200_000,), left),
+        mixture,
+        p=p,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return torch.bincount(drawn, minlength=left + 1) / 200_000
+
+
+def test_distributions() -> None:
+    left, p = 6, 0.3
+    uniform = torch.full((7,), 1 / 7)
+    geometric = torch.tensor([p * (1 - p) ** k for k in range(7)])
+    geometric[-1] += 1 - geometric.sum()  # clipped to the last state
+    last = torch.zeros(7)
+    last[-1] = 1.0
+    assert (shares({"uniform": 2.0}, left) - uniform).abs().max() < 0.004
+    assert (shares({"geometric": 0.1}, left, p) - geometric).abs().max() < 0.004
+    mixed = 0.5 * last + 0.3 * geometric + 0.2 * uniform
+    drawn = shares({"last": 5, "geometric": 3, "uniform": 2}, left, p)
+    assert (drawn - mixed).abs().max() < 0.004
+    assert shares({"geometric": 1.0}, left, 1.0)[0] == 1.0
+
+
+# --- reading -------------------------------------------------------------------------
+
+
+def both(layout: EntityLayout) -> list[FutureGoal]:
+    return [WindowGoal(layout, 1), HindsightGoal(layout, lambda a, d: a[:, 0])]
+
+
+@pytest.mark.parametrize("kind", ["contiguous", "columns of more", "memmap"])
+@pytest.mark.parametrize("chosen", [None, [2, 0, 2]])
+def test_flat_goals(kind: str, chosen: list[int] | None, tmp_path) -> None:
+    state = torch.arange(12.0).view(3, 4)
+    if kind == "columns of more":
+        state = torch.cat([state, state], 1)[:, :4]
+    data = TensorDict({("next", "observation"): state}, [3])
+    if kind == "memmap":
+        data = data.memmap(tmp_path)
+    rows = None if chosen is None else torch.tensor(chosen)
+    wanted = [[4.0 * row + 3, 4.0 * row + 1] for row in chosen or [0, 1, 2]]
+    for goals in both(FLAT):
+        assert goals.read_goals(data, rows)["desired_goal"].tolist() == wanted
+
+
+@pytest.mark.parametrize("chosen", [None, [2, 0, 2]])
+def test_nested_goals(chosen: list[int] | None) -> None:
+    row = torch.arange(3.0)
+    after = {"lid": row[:, None], "cup": {"y": {"a": -row}, "x": row.view(3, 1, 1)}}
+    data = TensorDict({"next": after}, [3])
+    rows = None if chosen is None else torch.tensor(chosen)
+    wanted = [float(row) for row in chosen or [0, 1, 2]]
+    for goals in both(NESTED):
+        found = goals.read_goals(data, rows)
+        # in layout order, and leaves of one entity by name
+        assert list(found) == [
+            "lid_goal",
+            ("goal", "cup", "x"),
+            ("goal", "cup", "y", "a"),
+        ]
+        values = [leaf.flatten().tolist() for leaf in found.values()]
+        assert values == [wanted, wanted, [-value for value in wanted]]

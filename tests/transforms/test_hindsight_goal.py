@@ -1,0 +1,643 @@
+"""HindsightGoal against a slow oracle that looks at each row of a batch by itself."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import dataclass
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import (
+    HERReplayBuffer,
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    TensorDictReplayBuffer,
+)
+from torchrl.envs.transforms import DoubleToFloat, Transform
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.transforms import CAIACTransform, HindsightGoal
+
+# Goal columns 2, 0 are the cup's, column 1 the box's; observation column 4 is nobody's.
+FLAT = EntityLayout(
+    {"arm": [0], "cup": [1, 2], "box": [3]},
+    goal={"cup": [2, 0], "box": [1]},
+    achieved={"cup": [1, 2], "box": [3]},
+    fixed=["arm"],
+)
+NESTED = EntityLayout.from_keys(
+    {"arm": ("s", "arm"), "cup": ("s", "cup"), "box": ("s", "box")},
+    goal={"cup": ("g", "cup"), "box": ("g", "box")},
+    achieved={"cup": ("s", "cup"), "box": ("s", "box")},
+    fixed=["arm"],
+)
+THRESHOLD = 0.5
+STRIDE = 8
+
+
+def reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+    """Whole numbers, so that no rounding is in the way."""
+    return -(achieved - desired).abs().sum(-1)
+
+
+def make(
+    lengths: list[int],
+    layout: EntityLayout = FLAT,
+    *,
+    stale: bool = False,
+    achieved: bool = False,
+    dtype: torch.dtype = torch.float32,
+    seed: int = 0,
+) -> TensorDict:
+    """Rows that name themselves: column c of row r holds ``r * STRIDE + c``.
+
+    Next states hold the same of row r + 1, desired goals are negative. With ``stale``
+    all rewards are 0.5, which ``reward`` never returns; with ``achieved``, flat data
+    hold the achieved goals as well.
+    """
+    total = sum(lengths)
+    rows = torch.arange(total)
+    done = torch.zeros(total, 1, dtype=torch.bool)
+    done[torch.tensor(lengths).cumsum(0) - 1] = True
+    state = (rows.view(-1, 1) * STRIDE + torch.arange(5)).to(dtype)
+    goal = -1 - (rows.view(-1, 1) * STRIDE + torch.tensor([2, 3, 1])).to(dtype)
+    generator = torch.Generator().manual_seed(seed)
+    td = TensorDict(
+        {
+            "row": rows,
+            "episode": torch.repeat_interleave(
+                torch.arange(len(lengths)), torch.tensor(lengths)
+            ),
+            "action": torch.rand(total, 2, generator=generator),
+            "next": {"done": done, "terminated": torch.zeros_like(done)},
+            ("caiac", "score"): torch.rand(total, 3, generator=generator),
+        },
+        [total],
+    )
+    if layout is FLAT:
+        td.update({"observation": state, "desired_goal": goal})
+        td["next", "observation"] = state + STRIDE
+        td["next", "desired_goal"] = goal.clone()
+        if achieved:
+            td["achieved_goal"] = state[:, [2, 3, 1]]
+            td["next", "achieved_goal"] = state[:, [2, 3, 1]] + STRIDE
+    else:
+        for where, value in (((), state), (("next",), state + STRIDE)):
+            td[(*where, "s", "arm")] = value[:, :1]
+            td[(*where, "s", "cup", "x")] = value[:, 1:2]
+            td[(*where, "s", "cup", "y")] = value[:, 2]
+            td[(*where, "s", "box")] = value[:, 3:4]
+            td[(*where, "g", "cup", "x")] = goal[:, 2:]
+            td[(*where, "g", "cup", "y")] = goal[:, 0]
+            td[(*where, "g", "box")] = goal[:, 1:2]
+    gained = reward(vectors(td, "next"), vectors(td)).unsqueeze(-1)
+    td["next", "reward"] = torch.full_like(gained, 0.5) if stale else gained
+    return td
+
+
+def vectors(td: TensorDictBase, which: str = "goal") -> torch.Tensor:
+    """Cup's two and box's one value ``[B, 3]`` of goals, states or next states."""
+    if "observation" in td:
+        if which == "goal":
+            return td["desired_goal"][:, [2, 0, 1]]
+        source = td["observation"] if which == "now" else td["next", "observation"]
+        return source[:, 1:4]
+    td = td["next"] if which == "next" else td
+    td = td["g"] if which == "goal" else td["s"]
+    return torch.cat([td["cup", "x"], td["cup", "y"].unsqueeze(-1), td["box"]], -1)
+
+
+@dataclass
+class Arm:
+    rb: ReplayBuffer
+    goals: HindsightGoal
+    lengths: list[int]
+    caiac: CAIACTransform | None
+
+
+def arm(
+    lengths: list[int],
+    layout: EntityLayout = FLAT,
+    *,
+    order: str = "augment, relabel",
+    storage: type = LazyTensorStorage,
+    size: int | None = None,
+    batch: int = 8,
+    ids: bool = True,
+    seed: int = 0,
+    caiac: dict | None = None,
+    data: dict | None = None,
+    prefetch: int | None = None,
+    kind: type[ReplayBuffer] = ReplayBuffer,
+    rb_kwargs: dict | None = None,
+    **kwargs,
+) -> Arm:
+    """A buffer that is filled piece by piece and has the transforms in some order."""
+    content = make(lengths, layout, seed=seed, **(data or {}))
+    if not ids:
+        content = content.exclude("episode")
+    goals = HindsightGoal(
+        layout, reward, generator=torch.Generator().manual_seed(seed), **kwargs
+    )
+    augment = CAIACTransform(
+        layout,
+        THRESHOLD,
+        generator=torch.Generator().manual_seed(seed + 1),
+        **(caiac or {}),
+    )
+    rb_kwargs = rb_kwargs or {}
+    if kind is HERReplayBuffer:
+        rb_kwargs = {"reward_fn": goals.her_reward, **rb_kwargs}
+    rb = kind(
+        storage=storage(size or len(content)),
+        sample_unit=goals if goals.future else None,
+        batch_size=batch,
+        prefetch=prefetch,
+        **rb_kwargs,
+    )
+    for begin in range(0, len(content), 3):
+        rb.extend(content[begin : begin + 3])
+    rb.set_rng(torch.Generator().manual_seed(seed + 2))
+    known: dict[str, Transform] = {"augment": augment, "relabel": goals}
+    for name in order.split(", "):
+        rb.append_transform(known[name])
+    return Arm(rb, goals, lengths, augment if "augment" in order else None)
+
+
+def check_batch(
+    case: Arm, batch: TensorDictBase, stored: TensorDictBase, *, her: int = 0
+) -> None:
+    """Raises where a row is anything that it may not be.
+
+    ``stored`` are the batch's rows as they lie in the storage; the first ``her`` rows
+    were relabelled by HERReplayBuffer.
+    """
+    goals, rows = case.goals, batch.shape[0]
+    relabeled = batch["hindsight", "relabeled"]
+    assert relabeled.shape == (rows, 1) and relabeled.dtype == torch.bool
+    if case.caiac is None:
+        assert ("caiac", "counterfactual") not in leaves(batch)
+        marks = [False] * rows
+    else:
+        marks = batch["caiac", "counterfactual"][:, 0].tolist()
+        assert sum(marks) == case.caiac.num_counterfactual(rows)
+    ends = torch.tensor(case.lengths).cumsum(0).sub(1).tolist()
+    goal, kept = vectors(batch).tolist(), vectors(stored).tolist()
+    reached, origin = vectors(batch, "next").tolist(), vectors(batch, "now").tolist()
+    gained, before = batch["next", "reward"], stored["next", "reward"]
+    new = {("hindsight", "relabeled")}
+    if case.caiac is not None:
+        new |= {("caiac", "counterfactual"), ("caiac", "swapped")}
+    assert leaves(batch) - leaves(stored) - {("index",)} == new
+    assert leaves(stored) <= leaves(batch)
+    follows = ("desired_goal", "g", "reward")
+    for b in range(rows):
+        again = bool(relabeled[b])
+        if not marks[b]:
+            for key in leaves(stored):  # invariant 3
+                if not again or not any(name in follows for name in key):
+                    assert torch.equal(batch[key][b], stored[key][b]), (b, key)
+        if again and marks[b]:
+            options = [reached[i] for i in range(rows) if marks[i]]
+            assert goals.counterfactual > 0 and goal[b] in options
+        elif again:
+            name = int(stored["row"][b])
+            last = next(end for end in ends if end >= name)
+            options = [
+                [(later + 1) * STRIDE + column for column in (1, 2, 3)]
+                for later in range(name, last + 1)
+            ]
+            if b >= her:
+                options = options if goals.future else []
+                if goals.random:
+                    options += [reached[i] for i in range(rows) if not marks[i]]
+            assert goal[b] in options
+        elif marks[b]:
+            # each entity's goal is the one that was stored beside its state
+            assert goal[b] == [-1 - value for value in origin[b]]
+        else:
+            assert goal[b] == kept[b]
+        wanted = -sum(abs(x - y) for x, y in zip(reached[b], goal[b], strict=True))
+        if again or marks[b] or float(before[b]) != 0.5:
+            assert float(gained[b]) == wanted
+        else:
+            assert float(gained[b]) == 0.5
+    if ("next", "desired_goal") in leaves(batch):
+        assert torch.equal(batch["next", "desired_goal"], batch["desired_goal"])
+    if ("next", "g", "box") in leaves(batch):
+        assert (batch["next", "g"] == batch["g"]).all()
+
+
+def leaves(td: TensorDictBase) -> set[tuple[str, ...]]:
+    return {k if isinstance(k, tuple) else (k,) for k in td.keys(True, True)}
+
+
+def stored_rows(rb: ReplayBuffer, batch: TensorDictBase) -> TensorDictBase:
+    raw = rb.storage[:]
+    place = {int(row): i for i, row in enumerate(raw["row"])}
+    return raw[torch.tensor([place[row] for row in batch["row"].tolist()])]
+
+
+ORDERS = ["augment, relabel", "relabel, augment", "relabel"]
+shares = st.sampled_from([0.0, 0.3, 0.5, 1.0])
+
+
+@st.composite
+def settings_of_arms(draw: st.DrawFn) -> dict:
+    lengths = draw(st.lists(st.integers(1, 9), min_size=1, max_size=5))
+    total = sum(lengths)
+    future = draw(shares)
+    return {
+        "lengths": lengths,
+        "layout": draw(st.sampled_from([FLAT, NESTED])),
+        "order": draw(st.sampled_from(ORDERS)),
+        "storage": draw(st.sampled_from([LazyTensorStorage, LazyMemmapStorage])),
+        # smaller than the data: a ring that was written past its end
+        "size": draw(st.integers(max(3, total // 2), total + 3)),
+        "batch": draw(st.integers(1, 12)),
+        "ids": draw(st.booleans()),
+        "seed": draw(st.integers(0, 2**20)),
+        "future": future,
+        "random": draw(shares.map(lambda share: min(share, 1 - future))),
+        "counterfactual": draw(shares),
+        "strategy": draw(st.sampled_from(["geometric", "uniform"])),
+        "caiac": {
+            "counterfactual_ratio": draw(shares),
+            "swap_prob": draw(st.sampled_from([0.0, 0.5, 1.0])),
+            "reward_fn": draw(st.sampled_from([None, reward])),
+        },
+        "data": {"stale": draw(st.booleans())},
+        "prefetch": draw(st.sampled_from([None, 1])),
+    }
+
+
+@settings(max_examples=80, suppress_health_check=[HealthCheck.too_slow])
+@given(kwargs=settings_of_arms())
+def test_rows_are_what_they_may_be(kwargs: dict) -> None:
+    case = arm(**kwargs)
+    raw = case.rb.storage[:].clone()
+    twin = arm(**kwargs)
+    for _ in range(2):
+        batch = case.rb.sample()
+        check_batch(case, batch, stored_rows(case.rb, batch))
+        assert (batch == twin.rb.sample()).all()  # the same generators
+    assert (case.rb.storage[:] == raw).all()
+
+
+# --- distributions -------------------------------------------------------------------
+
+
+def chi2(counts: torch.Tensor, expected: torch.Tensor) -> float:
+    return float(((counts - expected) ** 2 / expected).sum())
+
+
+@pytest.mark.parametrize("strategy", ["geometric", "uniform"])
+def test_offsets_of_future_goals(strategy: str) -> None:
+    case = arm([3, 12, 4], future=1.0, strategy=strategy, order="relabel")
+    rows = torch.full((40_000,), 5)  # nine more rows of the trajectory follow
+    case.goals.expand(rows, {}, case.rb.storage)
+    batch = case.goals(case.rb.storage[rows])
+    assert batch["hindsight", "relabeled"].all()
+    offset = ((vectors(batch)[:, 0] - 1) / STRIDE).long() - 1 - 5
+    counts = torch.bincount(offset, minlength=10).double()
+    share = torch.full((10,), 0.1, dtype=torch.double)
+    if strategy == "geometric":
+        share = 0.2 * 0.8 ** torch.arange(10, dtype=torch.double)
+        share[-1] += 1 - share.sum()  # cut at the trajectory's end
+    assert chi2(counts, share * len(rows)) < 27.9  # 9 degrees of freedom, p = 0.001
+
+
+def test_shares_and_sources() -> None:
+    goals = HindsightGoal(
+        FLAT,
+        reward,
+        future=0.5,
+        random=0.2,
+        counterfactual=0.4,
+        generator=torch.Generator().manual_seed(0),
+    )
+    marks = torch.arange(40).unsqueeze(-1) % 4 == 3  # anywhere, not only at the end
+    future = {"desired_goal": torch.zeros(40, 3)}
+    draws = [goals.generate_parameters(marks, future).source for _ in range(2000)]
+    source = torch.stack(draws)
+    own = torch.arange(40)
+    kind = torch.where(source < 40, 0, torch.where(source < 80, 1, 2))
+    assert (source[kind == 0] == own.expand_as(source)[kind == 0]).all()
+    assert (source[kind == 2] == 80 + own.expand_as(source)[kind == 2]).all()
+    mark = marks[:, 0]
+    for group, wanted in ((~mark, (0.3, 0.2, 0.5)), (mark, (0.6, 0.4, 0.0))):
+        for number, share in enumerate(wanted):
+            found = (kind[:, group] == number).double().mean()
+            assert found == pytest.approx(share, abs=0.01)
+        # a random goal is any of the rows of the same kind, all with the same chance
+        picks = source[:, group][kind[:, group] == 1] - 40
+        counts = torch.bincount(picks, minlength=40).double()
+        assert counts[~group].sum() == 0
+        number = int(group.sum())
+        expected = torch.full((number,), len(picks) / number, dtype=torch.double)
+        assert chi2(counts[group], expected) < 58.3  # at most 29 degrees of freedom
+
+
+# --- arms ----------------------------------------------------------------------------
+
+
+def test_relabel_only_relabels_the_same_share_and_swaps_nothing() -> None:
+    case = arm([40, 40], batch=4000, caiac={"swap_prob": 0.0})
+    batch = case.rb.sample()
+    stored = stored_rows(case.rb, batch)
+    assert not batch["caiac", "swapped"].any()
+    for key in ("observation", ("next", "observation"), "action"):
+        assert torch.equal(batch[key], stored[key])
+    relabeled = batch["hindsight", "relabeled"][:, 0]
+    for half in (slice(0, 2000), slice(2000, 4000)):
+        assert relabeled[half].double().mean() == pytest.approx(0.5, abs=0.05)
+    # counterfactual goals come from anywhere, real ones from the row's own future
+    reached = (vectors(batch)[:, 0] - 1) / STRIDE - 1
+    own = torch.where(batch["row"] < 40, 0, 1) == torch.where(reached < 40, 0, 1)
+    assert own[:2000][relabeled[:2000]].all()
+    assert own[2000:][relabeled[2000:]].double().mean() == pytest.approx(0.5, abs=0.06)
+
+
+def test_without_augmentation_the_same_share_is_random() -> None:
+    case = arm([40, 40], batch=4000, order="relabel", random=0.25)
+    batch = case.rb.sample()
+    relabeled = batch["hindsight", "relabeled"][:, 0]
+    assert relabeled.double().mean() == pytest.approx(0.75, abs=0.04)
+    reached = (vectors(batch)[:, 0] - 1) / STRIDE - 1
+    earlier = relabeled & (reached < batch["row"])  # no row of the future
+    assert 0.08 < earlier.double().mean() < 0.2
+    assert ("caiac", "counterfactual") not in leaves(batch)
+
+
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+def test_goals_of_counterfactual_rows_follow_the_swap(layout: EntityLayout) -> None:
+    for order in ORDERS[:2]:
+        case = arm(
+            [30, 30],
+            layout,
+            order=order,
+            batch=64,
+            counterfactual=1.0,
+            caiac={"counterfactual_ratio": 0.5},
+        )
+        batch = case.rb.sample()
+        check_batch(case, batch, stored_rows(case.rb, batch))
+        goal = vectors(batch)[32:]
+        # the cup and the box of one goal come from different rows
+        assert ((goal[:, 0] // STRIDE) != (goal[:, 2] // STRIDE)).any()
+        assert batch["hindsight", "relabeled"][32:].all()
+
+
+def test_rewards_of_the_augmentation_are_the_same() -> None:
+    for layout in (FLAT, NESTED):
+        case = arm([9, 9], layout, counterfactual=0.0, data={"stale": True})
+        raw = case.rb.storage[:]
+        case.goals.expand(torch.arange(18), {}, case.rb.storage)
+        augment = CAIACTransform(layout, THRESHOLD, reward_fn=reward)
+        swapped = augment(raw)
+        rewards = swapped["next", "reward"][9:]
+        assert (rewards != 0.5).all()
+        out = case.goals(swapped)
+        assert torch.equal(out["next", "reward"][9:], rewards)
+
+
+# --- HERReplayBuffer -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ORDERS[:2])
+@pytest.mark.parametrize("swap_prob", [0.0, 1.0])
+def test_with_her_replay_buffer(order: str, swap_prob: float) -> None:
+    def build(her_ratio: float) -> Arm:
+        return arm(
+            [7, 4, 9],
+            order=order,
+            batch=16,
+            kind=HERReplayBuffer,
+            rb_kwargs={
+                "her_ratio": her_ratio,
+                "achieved_goal_key": ("next", "achieved_goal"),
+            },
+            caiac={"swap_prob": swap_prob},
+            data={"stale": True, "achieved": True},
+            future=0.0,
+        )
+
+    case = build(0.25)
+    raw = case.rb.storage[:].clone()
+    seen = 0
+    for _ in range(20):
+        batch = case.rb.sample()
+        relabeled = batch["hindsight", "relabeled"][:, 0]
+        assert relabeled[:4].all() and not relabeled[4:8].any()
+        check_batch(case, batch, stored_rows(case.rb, batch), her=4)
+        seen += int(relabeled[8:].sum())
+    assert 50 < seen < 110
+    assert (case.rb.storage[:] == raw).all()
+    with pytest.raises(ValueError, match=r"first 12 rows.* 4 of which are counterfac"):
+        build(0.75).rb.sample()
+
+
+# --- what it composes with -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+def test_reading_a_full_storage_changes_nothing_in_it(layout, storage) -> None:
+    case = arm([9, 9], layout, storage=storage, future=0.0, random=1.0)
+    raw = case.rb.storage[:].clone()
+    out = case.rb[:]
+    assert out["hindsight", "relabeled"].any()
+    assert (case.rb.storage[:] == raw).all()
+    assert "hindsight" not in case.rb.storage[:]
+
+
+def test_draw_and_apply_are_apart() -> None:
+    case = arm([9, 9])
+    td = case.caiac(case.rb.storage[:])
+    before = td.clone()
+    future = case.goals.read_goals(td, torch.arange(18).flip(0))
+    draw = case.goals.generate_parameters(
+        td["caiac", "counterfactual"], future, torch.Generator().manual_seed(0)
+    )
+    one = case.goals.apply_parameters(td, draw)
+    assert (case.goals.apply_parameters(td, draw) == one).all()
+    assert (td == before).all() and leaves(td) == leaves(before)
+    with pytest.raises(ValueError, match="none are given"):
+        case.goals.generate_parameters(td["caiac", "counterfactual"])
+
+
+def test_under_prefetch_and_in_a_tensordict_buffer() -> None:
+    for order in ORDERS:
+        case = arm(
+            [9, 9, 9], order=order, kind=TensorDictReplayBuffer, prefetch=3, batch=6
+        )
+        for _ in range(10):
+            batch = case.rb.sample()
+            check_batch(case, batch, stored_rows(case.rb, batch))
+
+
+def test_writes_between_samples() -> None:
+    case = arm([9, 9, 9], size=10, future=1.0, order="relabel")
+    for begin in range(3):
+        batch = case.rb.sample()
+        check_batch(case, batch, stored_rows(case.rb, batch))
+        more = make([9, 9, 9, 9])[27 + 3 * begin : 30 + 3 * begin]
+        case.rb.extend(more)
+        case.lengths = [9, 9, 9, 3 * begin + 3]
+
+
+def test_stored_achieved_goals_and_flat_rewards() -> None:
+    layout = EntityLayout({"arm": [0], "cup": [1]}, goal={"arm": (), "cup": [0]})
+    goals = HindsightGoal(layout, reward, future=1.0, p=1.0, reward_key="r")
+    rb = ReplayBuffer(storage=LazyTensorStorage(6), sample_unit=goals, batch_size=6)
+    rb.append_transform(goals)
+    data = TensorDict(
+        {
+            "row": torch.arange(6),
+            "desired_goal": torch.zeros(6, 1),
+            ("next", "achieved_goal"): torch.arange(6.0, dtype=torch.double)[:, None],
+            ("next", "done"): torch.zeros(6, 1, dtype=torch.bool),
+            "r": torch.full((6,), 0.5),
+        },
+        [6],
+    )
+    rb.extend(data)
+    batch = rb.sample()
+    assert batch["desired_goal"].dtype == torch.float32
+    assert torch.equal(batch["desired_goal"][:, 0], batch["row"].float())
+    assert batch["r"].shape == (6,) and (batch["r"] == 0).all()
+    assert ("next", "desired_goal") not in leaves(batch)
+
+
+def test_renamed_keys() -> None:
+    augment = CAIACTransform(FLAT, counterfactual_key="cf", relabeled_key=("a", "b"))
+    goals = HindsightGoal(
+        FLAT,
+        reward,
+        future=0.0,
+        counterfactual=1.0,
+        counterfactual_key="cf",
+        relabeled_key=("a", "b"),
+    )
+    td = make([8])
+    td["caiac", "score"].zero_()
+    for out in (goals(augment(td)), augment(goals(td))):
+        assert out["a", "b"][:, 0].tolist() == [False] * 4 + [True] * 4
+        assert out["cf"][4:].all()
+
+
+def test_pickle_and_clone() -> None:
+    case = arm([9, 9], future=1.0, p=1.0)
+    for copy in (pickle.loads(pickle.dumps(case.goals)), case.goals.clone()):
+        rb = ReplayBuffer(storage=case.rb.storage, sample_unit=copy, batch_size=4)
+        rb.append_transform(copy)
+        batch = rb.sample()
+        assert torch.equal(vectors(batch), vectors(batch, "next"))
+        assert "future=1.0, random=0.0" in repr(copy)
+
+
+# --- bad input -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "match"),
+    [
+        ({"future": 1.1}, ValueError, r"future is in \[0, 1\]"),
+        ({"random": -0.1}, ValueError, r"random is in \[0, 1\]"),
+        ({"counterfactual": math.nan}, ValueError, "counterfactual is in"),
+        ({"counterfactual": True}, TypeError, "counterfactual is a number"),
+        ({"future": 0.6, "random": 0.5}, ValueError, "at most 1 together"),
+        ({"strategy": "last"}, ValueError, "'geometric' or 'uniform'"),
+        ({"p": 0.0}, ValueError, r"lies in \(0, 1\]"),
+        ({"reward_fn": 1.0}, TypeError, "reward_fn is a function"),
+        ({"generator": 0}, TypeError, "generator is a torch.Generator"),
+        ({"layout": {"cup": [0]}}, TypeError, "layout is an EntityLayout"),
+        ({"layout": EntityLayout({"cup": [0]})}, ValueError, "no goals"),
+        (
+            {"layout": EntityLayout.from_keys({"cup": "c"}, goal={"cup": "g"})},
+            ValueError,
+            r"achieved goals of \['cup'\]",
+        ),
+    ],
+)
+def test_arguments(arguments: dict, error: type, match: str) -> None:
+    with pytest.raises(error, match=match):
+        HindsightGoal(**{"layout": FLAT, "reward_fn": reward, **arguments})
+
+
+def test_without_a_sample_unit() -> None:
+    case = arm([9, 9])
+    with pytest.raises(RuntimeError, match="sample_unit="):
+        case.rb[:]
+    case.goals.expand(torch.arange(3), {}, case.rb.storage)
+    with pytest.raises(RuntimeError, match="drawn for 3 rows, but the batch has 18"):
+        case.goals(case.rb.storage[:])
+    twice = arm([9, 9], future=0.0, order="augment, relabel, relabel")
+    with pytest.raises(RuntimeError, match="relabelled already"):
+        twice.rb.sample()
+
+
+def test_goals_that_changed_before_the_augmentation() -> None:
+    case = arm([9, 9], order="relabel", data={"dtype": torch.double})
+    case.rb.append_transform(DoubleToFloat(in_keys=["desired_goal"]))
+    case.rb.append_transform(CAIACTransform(FLAT))
+    with pytest.raises(RuntimeError, match="append HindsightGoal behind the augment"):
+        case.rb.sample()
+    # a mark of a batch from elsewhere
+    td = HindsightGoal(FLAT, reward, future=0.0)(make([9])).clone()
+    with pytest.raises(RuntimeError, match="append HindsightGoal behind the augment"):
+        CAIACTransform(FLAT)(td)
+
+
+def test_data_that_do_not_fit() -> None:
+    goals = HindsightGoal(FLAT, reward, future=0.0)
+    td = make([9])
+    with pytest.raises(KeyError, match="no desired goals in 'desired_goal'"):
+        goals(td.exclude("desired_goal"))
+    with pytest.raises(KeyError, match=r"no \('next', 'reward'\).*reward_key"):
+        goals(td.exclude(("next", "reward")))
+    with pytest.raises(KeyError, match=r"read from \('next', 'observation'\)"):
+        goals(td.exclude(("next", "observation")))
+    with pytest.raises(ValueError, match=r"wanted \[B\]"):
+        goals(td.view(3, 3))
+    with pytest.raises(ValueError, match=r"\[9, 2\], wanted \[9, 1\]: one reward"):
+        goals(td.clone().set(("next", "reward"), torch.zeros(9, 2)))
+    with pytest.raises(
+        ValueError, match=r"'desired_goal' has shape \[9, 2\].*\[9, 3\]"
+    ):
+        goals(td.clone().set("desired_goal", torch.zeros(9, 2)))
+    with pytest.raises(ValueError, match=r"counterfactual'\) has shape \[9\]"):
+        goals(td.clone().set(("caiac", "counterfactual"), torch.zeros(9)))
+    with pytest.raises(ValueError, match=r"reward_fn returned \[\].*wanted \[9\]"):
+        HindsightGoal(FLAT, lambda a, d: (a - d).sum(), future=0.0)(td)
+    wide = td.clone().set(("next", "observation"), torch.zeros(9, 1, 5))
+    with pytest.raises(ValueError, match="5 columns in 3 dimensions"):
+        goals(wide)
+    case = arm([9, 9], NESTED)
+    nested = case.rb.storage[:].exclude(("next", "s", "box"))
+    with pytest.raises(KeyError, match="goals of 'box' are read"):
+        HindsightGoal(NESTED, reward, future=0.0)(nested)
+    with pytest.raises(KeyError, match="neither trajectory ids"):
+        rb = ReplayBuffer(storage=LazyTensorStorage(9))
+        rb.extend(td.exclude("episode", ("next", "done")))
+        HindsightGoal(FLAT, reward).expand(torch.arange(3), {}, rb.storage)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+def test_on_the_gpu(layout: EntityLayout) -> None:
+    td = make([8, 8], layout).to("cuda")
+    augment = CAIACTransform(layout, check=False)
+    goals = HindsightGoal(layout, reward, future=0.0, random=0.5)
+    goals(augment(td))
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        out = goals(augment(td))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert out["hindsight", "relabeled"].device.type == "cuda"

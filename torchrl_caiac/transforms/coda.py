@@ -1,0 +1,208 @@
+"""Counterfactual samples by the components of a local causal graph (CoDA)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.utils import NestedKey
+from torchrl.data import ReplayBuffer, TensorStorage
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms.components import (
+    MAX_ENTITIES,
+    ComponentDonors,
+    components,
+    draw_batch_components,
+)
+from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
+from torchrl_caiac.transforms.donors import RewardFn, SwapDraw
+from torchrl_caiac.transforms.window_goal import WindowGoal
+
+__all__ = ["CoDATransform"]
+
+
+class CoDATransform(CounterfactualTransform):
+    """Swaps independent parts of a state with those of other samples (CoDA).
+
+    The baseline of Pitis et al. (2020) that the paper compares with. Each row carries
+    a graph of local influence, from the entities and the action to the entities (see
+    :class:`~torchrl_caiac.influence.AttentionInfluence`). Links are scores above
+    ``threshold``, whatever their direction, and fall into connected components. In the
+    last ``round(counterfactual_ratio * B)`` rows of a batch, every component that does
+    not hold the action takes its states and next states from a donor row in which the
+    very same set of entities is a component that does not hold the action either.
+    Components draw their donors independently; the entities of one component share
+    theirs. With ``window`` κ > 1, entities belong together that are linked in any row
+    of the window.
+
+    A component that holds a ``fixed`` entity is not swapped. Goals, rewards, marks,
+    checks, donors in the batch or from a buffer, rows that were not scored, and what
+    happens where there is no donor: all as in
+    :class:`~torchrl_caiac.CAIACTransform`, which with the action's row alone
+    (``AttentionInfluence(model, action_only=True)``) is CoDA-action.
+
+    Args:
+        layout (EntityLayout): at most 64 entities.
+        threshold (float): the largest score of what is no link, θ. Defaults to 0.2.
+        counterfactual_ratio (float): share of rows (or windows) that become
+            counterfactual, in [0, 1]. Defaults to 0.5.
+        window (int): rows a window, κ. Defaults to 1.
+        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn, by
+            default among the rows of the same batch. Pickling the transform pickles
+            it.
+        graph_key (NestedKey): the graphs, ``[*, N + 1, N]``: from the row (the
+            entities in layout order, then the action) to the column. Defaults to
+            ``("coda", "graph")``.
+
+    Keyword Args:
+        swap_prob (float): probability of swapping each component. Defaults to 1.
+        reward_fn (callable, optional): ``(next_achieved [C, G], desired [C, G])`` to
+            rewards ``[C]`` or ``[C, 1]``; recomputes the rewards of counterfactual
+            rows.
+        reward_key (NestedKey): the rewards. Defaults to ``("next", "reward")``.
+        goals (WindowGoal, optional): draws the goals of donor windows of a donor
+            buffer; without it they are the stored ones.
+        generator (torch.Generator, optional): source of randomness; torch's default
+            generator without it. The same state gives the same batch.
+        counterfactual_key (NestedKey): the mark of counterfactual rows, bool
+            ``[B * κ, 1]``. Defaults to ``("caiac", "counterfactual")``.
+        swapped_key (NestedKey): the mark of swapped entities, bool ``[B * κ, N]``.
+            Defaults to ``("caiac", "swapped")``.
+        relabeled_key (NestedKey): the mark of a
+            :class:`~torchrl_caiac.transforms.HindsightGoal` that was appended before.
+            Defaults to ``("hindsight", "relabeled")``.
+        trajectory_key (NestedKey): trajectory ids, to check that windows do not cross
+            trajectories and to find donor windows. Defaults to ``"episode"``.
+        done_key (NestedKey): end flags, read where there are no ids. Defaults to
+            ``("next", "done")``.
+        check (bool): check the values of each batch: graphs, windows, observations.
+            Defaults to ``True``.
+
+    Raises:
+        TypeError: an argument has the wrong type.
+        ValueError: an argument is out of range, or there are more than 64 entities.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> from torchrl_caiac import CoDATransform, EntityLayout
+        >>> layout = EntityLayout(
+        ...     {"arm": [0], "cup": [1], "lid": [2], "box": [3]}, fixed=["arm"]
+        ... )
+        >>> graph = torch.zeros(5, 4)  # from arm, cup, lid, box, action
+        >>> graph[1, 2] = graph[4, 0] = 1.0  # the cup moves the lid, the action the arm
+        >>> rb = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=2)
+        >>> state = torch.arange(400.0).view(100, 4)
+        >>> _ = rb.extend(TensorDict({
+        ...     "observation": state, ("next", "observation"): state + 0.5,
+        ...     ("coda", "graph"): graph.expand(100, 5, 4)}, [100]))
+        >>> rb.append_transform(CoDATransform(layout))  # doctest: +ELLIPSIS
+        ReplayBuffer(...)
+        >>> batch = rb.sample()
+        >>> batch["caiac", "swapped"]
+        tensor([[False, False, False, False],
+                [False,  True,  True,  True]])
+        >>> _, cup, lid, _ = batch["observation"][1]
+        >>> lid - cup  # still those of one row
+        tensor(1.)
+    """
+
+    donors_class = ComponentDonors
+    _what = "graphs"
+    _key_argument = "graph_key"
+    _wanted = "a score from each entity and the action to each of"
+
+    def __init__(
+        self,
+        layout: EntityLayout,
+        threshold: float = 0.2,
+        counterfactual_ratio: float = 0.5,
+        window: int = 1,
+        donors: ReplayBuffer | TensorStorage | None = None,
+        graph_key: NestedKey = ("coda", "graph"),
+        *,
+        swap_prob: float = 1.0,
+        reward_fn: RewardFn | None = None,
+        reward_key: NestedKey = ("next", "reward"),
+        goals: WindowGoal | None = None,
+        generator: torch.Generator | None = None,
+        counterfactual_key: NestedKey = ("caiac", "counterfactual"),
+        swapped_key: NestedKey = ("caiac", "swapped"),
+        relabeled_key: NestedKey = ("hindsight", "relabeled"),
+        trajectory_key: NestedKey = "episode",
+        done_key: NestedKey = ("next", "done"),
+        check: bool = True,
+    ) -> None:
+        super().__init__(
+            layout,
+            threshold=threshold,
+            counterfactual_ratio=counterfactual_ratio,
+            swap_prob=swap_prob,
+            window=window,
+            donors=donors,
+            score_key=graph_key,
+            reward_fn=reward_fn,
+            reward_key=reward_key,
+            goals=goals,
+            generator=generator,
+            counterfactual_key=counterfactual_key,
+            swapped_key=swapped_key,
+            relabeled_key=relabeled_key,
+            trajectory_key=trajectory_key,
+            done_key=done_key,
+            check=check,
+        )
+        if len(layout) > MAX_ENTITIES:
+            raise ValueError(
+                f"the layout has {len(layout)} entities, but components are bit masks "
+                f"of at most {MAX_ENTITIES}: lay entities together that never part"
+            )
+        self._fixed = layout.fixed_mask
+
+    @property
+    def graph_key(self) -> NestedKey:
+        """Where the graphs are."""
+        return self.score_key
+
+    @property
+    def feature_shape(self) -> tuple[int, ...]:
+        """The shape of one row's graph, ``(N + 1, N)``."""
+        return len(self.layout) + 1, len(self.layout)
+
+    def swappable(self, scores: torch.Tensor) -> torch.Tensor:
+        """The components of each window that may be swapped, :func:`components`.
+
+        Args:
+            scores (torch.Tensor): the graphs ``[B * window, N + 1, N]``.
+
+        Returns:
+            torch.Tensor: int64 ``[B, N]``, the component of each entity as a bit mask,
+            0 where it holds the action or a fixed entity.
+        """
+        if self._fixed.device != scores.device:
+            self._fixed = self._fixed.to(scores.device)
+        return components(scores, self.threshold, window=self.window, fixed=self._fixed)
+
+    def draw_in_batch(
+        self,
+        free: torch.Tensor,
+        num_counterfactual: int,
+        generator: torch.Generator | None,
+    ) -> SwapDraw:
+        """Draws a donor for each component, :func:`draw_batch_components`.
+
+        Args:
+            free (torch.Tensor): int64 ``[B, N]``.
+            num_counterfactual (int): how many windows become counterfactual.
+            generator (torch.Generator, optional): source of randomness.
+
+        Returns:
+            SwapDraw: the draw.
+        """
+        return draw_batch_components(
+            free,
+            num_counterfactual,
+            window=self.window,
+            swap_prob=self.swap_prob,
+            generator=generator,
+        )

@@ -1,0 +1,405 @@
+"""Connected components of local graphs, and drawing donors for them (CoDA).
+
+A component is an int64 bit mask, the bit ``i`` set for the entity ``i``, so at most 64
+entities. Notation as in :mod:`torchrl_caiac.transforms.donors`.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+
+from torchrl_caiac.transforms.donors import (
+    _CHUNK,
+    _RANDOM_BITS,
+    BufferDonors,
+    SwapDraw,
+    TrajectoryIndex,
+    _rand,
+)
+
+__all__ = [
+    "MAX_ENTITIES",
+    "ComponentDonors",
+    "ComponentIndex",
+    "component_starts",
+    "components",
+    "draw_batch_components",
+    "draw_buffer_components",
+]
+
+MAX_ENTITIES = 64
+
+# Elements of graphs that are looked at together while an index is built.
+_CHUNK_ELEMENTS = 1 << 24
+
+
+class ComponentIndex(NamedTuple):
+    """The rows of a storage at which donor windows may start, component by component.
+
+    Attributes:
+        masks (torch.Tensor): int64 ``[U]``, ascending, the components there are.
+        starts (torch.Tensor): integer ``[M]``, the rows for the first component, then
+            for the second, and so on.
+        offset (torch.Tensor): int64 ``[U]``, where a component's rows begin.
+        size (torch.Tensor): int64 ``[U]``, how many it has.
+    """
+
+    masks: torch.Tensor
+    starts: torch.Tensor
+    offset: torch.Tensor
+    size: torch.Tensor
+
+
+# --- bit masks -----------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def _bits(entities: int, device: torch.device) -> torch.Tensor:
+    """The bit of each entity, int64 ``[N]``."""
+    bits = [1 << i if i < 63 else -(1 << 63) for i in range(entities)]
+    return torch.tensor(bits, dtype=torch.int64, device=device)
+
+
+@lru_cache(maxsize=64)
+def _lower_bits(entities: int, device: torch.device) -> torch.Tensor:
+    """The bits of the entities before each one, int64 ``[N]``."""
+    lower = [(1 << i) - 1 for i in range(entities)]
+    return torch.tensor(lower, dtype=torch.int64, device=device)
+
+
+def _packed(chosen: torch.Tensor) -> torch.Tensor:
+    """The bit mask of bools ``[*, N]``, int64 ``[*]``."""
+    return (chosen * _bits(chosen.shape[-1], chosen.device)).sum(-1)
+
+
+def _links(graphs: torch.Tensor, threshold: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """What each entity is linked to, ``[R, N]``, and what the action is, ``[R]``."""
+    entities = graphs.shape[-1]
+    # NaN, that is not scored, links everything: nothing may be swapped.
+    linked = ~(graphs <= threshold)
+    among, action = linked[:, :entities], linked[:, entities]
+    return _packed(among | among.mT), _packed(action)
+
+
+def _joined(links: torch.Tensor, held: torch.Tensor) -> torch.Tensor:
+    """The component of each entity, 0 where it touches ``held``, int64 ``[R, N]``."""
+    entities = links.shape[-1]
+    # Warshall's closure of all graphs at once: whoever reaches k reaches what k does.
+    masks = links.t().contiguous() | _bits(entities, links.device).unsqueeze(-1)
+    for k in range(entities):
+        masks |= -((masks >> k) & 1) & masks[k]
+    return torch.where(masks & held == 0, masks, 0).t().contiguous()
+
+
+def _leads(masks: torch.Tensor) -> torch.Tensor:
+    """Whether an entity is the first one of its component, bool ``[R, N]``."""
+    lower = _lower_bits(masks.shape[-1], masks.device)
+    return (masks & lower == 0) & (masks != 0)
+
+
+def _leader(masks: torch.Tensor) -> torch.Tensor:
+    """The first entity of each component, int64 ``[R, N]``, 0 where there is none."""
+    # As a power of two in float64, which is exact, bit 63 (the sign) included.
+    lowest = (masks & -masks).double().abs()
+    return (torch.frexp(lowest).exponent - 1).clamp_min(0).long()
+
+
+def components(
+    graphs: torch.Tensor,
+    threshold: float,
+    *,
+    window: int = 1,
+    fixed: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """The component of each entity in each window's graph (CoDA).
+
+    Two entities belong together where, in any row of the window and in any direction,
+    one influences the other by more than ``threshold``, or by a chain of such links.
+    The action's links only tell which components it holds.
+
+    Args:
+        graphs (torch.Tensor): ``[B * window, N + 1, N]``, from the row (the entities,
+            then the action) to the column; NaN, not scored, counts as a link.
+        threshold (float): the largest score of what is no link, θ.
+
+    Keyword Args:
+        window (int): rows a window. Defaults to 1.
+        fixed (torch.Tensor, optional): bool ``[N]``, entities that are never swapped.
+
+    Returns:
+        torch.Tensor: int64 ``[B, N]``, the component as a bit mask; 0 where it holds
+        the action or a fixed entity.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.components import components
+        >>> graph = torch.zeros(1, 5, 4)
+        >>> graph[0, 1, 2] = graph[0, 4, 0] = 1.0  # entity 1 to 2, action to entity 0
+        >>> components(graph, 0.2)
+        tensor([[0, 6, 6, 8]])
+    """
+    if window > 1:
+        graphs = graphs.unflatten(0, (-1, window)).amax(1)
+    links, held = _links(graphs, threshold)
+    if fixed is not None:
+        held = held | _packed(fixed.to(held.device))
+    return _joined(links, held)
+
+
+# --- drawing -------------------------------------------------------------------------
+
+
+def _shared(
+    masks: torch.Tensor, swap_prob: float, generator: torch.Generator | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What all entities of a component share: leader, random number, being wanted."""
+    leader, device = _leader(masks), masks.device
+    wanted = masks != 0
+    if swap_prob < 1.0:
+        chance = _rand(torch.rand, masks.shape, device=device, generator=generator)
+        wanted = wanted & (chance < swap_prob).gather(1, leader)
+    pick = _rand(
+        torch.randint, _RANDOM_BITS, masks.shape, device=device, generator=generator
+    )
+    return leader, pick.gather(1, leader), wanted
+
+
+def draw_batch_components(
+    masks: torch.Tensor,
+    num_counterfactual: int,
+    *,
+    window: int = 1,
+    swap_prob: float = 1.0,
+    generator: torch.Generator | None = None,
+) -> SwapDraw:
+    """Draws donors among the windows of the batch itself.
+
+    Each component of each of the last windows draws one of the *other* windows that
+    have the same component, all with the same probability and independently of the
+    other components.
+
+    Args:
+        masks (torch.Tensor): int64 ``[B, N]``, of :func:`components`.
+        num_counterfactual (int): how many windows become counterfactual, ``C``.
+
+    Keyword Args:
+        window (int): rows a window. Defaults to 1.
+        swap_prob (float): probability of swapping a component. Defaults to 1.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        SwapDraw: the donors as rows of the batch, the same for all entities of a
+        component.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.components import draw_batch_components
+        >>> masks = torch.tensor([[3, 3, 0], [1, 2, 4], [3, 3, 4]])
+        >>> draw = draw_batch_components(masks, 1)
+        >>> draw.donors, draw.swapped
+        (tensor([[0, 0, 1]]), tensor([[True, True, True]]))
+    """
+    windows, entities = masks.shape
+    first = windows - num_counterfactual
+    tail = masks[first:]
+    leader, pick, wanted = _shared(tail, swap_prob, generator)
+    # The windows of each component lie together, each once: under its leader.
+    keys, order = torch.where(_leads(masks), masks, 0).flatten().sort(stable=True)
+    place = torch.empty_like(order)
+    place[order] = torch.arange(len(order), device=masks.device)
+    begin = torch.searchsorted(keys, tail)
+    others = torch.searchsorted(keys, tail, right=True) - begin - 1
+    chosen = begin + pick % others.clamp_min(1)
+    # A window is among those of its own component: step over it.
+    chosen += chosen >= place.view(windows, entities)[first:].gather(1, leader)
+    donors = order[chosen.clamp_max(len(order) - 1)] // entities
+    found = others > 0
+    return SwapDraw(donors * window, wanted & found, (wanted & ~found).sum(0))
+
+
+def draw_buffer_components(
+    masks: torch.Tensor,
+    index: ComponentIndex,
+    *,
+    swap_prob: float = 1.0,
+    generator: torch.Generator | None = None,
+) -> SwapDraw:
+    """Draws donors among the windows of a donor storage that have the same component.
+
+    Args:
+        masks (torch.Tensor): int64 ``[C, N]``, of :func:`components`.
+        index (ComponentIndex): the components of the storage's windows.
+
+    Keyword Args:
+        swap_prob (float): probability of swapping a component. Defaults to 1.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        SwapDraw: the donors as rows of the storage, the same for all entities of a
+        component.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.components import (
+        ...     ComponentIndex,
+        ...     draw_buffer_components,
+        ... )
+        >>> index = ComponentIndex(*torch.tensor([[3], [7], [0], [1]]))
+        >>> draw = draw_buffer_components(torch.tensor([[3, 3, 4]]), index)
+        >>> draw.donors[draw.swapped]
+        tensor([7, 7])
+    """
+    device, home = masks.device, index.masks.device
+    _, pick, wanted = _shared(masks, swap_prob, generator)
+    place = torch.searchsorted(index.masks, masks.to(home))
+    place = place.clamp_max(index.masks.shape[0] - 1)
+    found = (index.masks[place] == masks.to(home)).to(device)
+    chosen = pick.to(home) % index.size[place].clamp_min(1) + index.offset[place]
+    donors = index.starts[chosen].to(device, torch.int64)
+    return SwapDraw(donors, wanted & found, (wanted & ~found).sum(0))
+
+
+# --- what may be drawn from a storage ------------------------------------------------
+
+
+def _slid(links: torch.Tensor, window: int) -> torch.Tensor:
+    """All links of each row and the ``window - 1`` rows behind it."""
+    size = 1
+    while size < window:
+        step = min(size, window - size)
+        links = links[:-step] | links[step:]
+        size += step
+    return links
+
+
+def component_starts(
+    graphs: torch.Tensor,
+    threshold: float,
+    fixed: torch.Tensor,
+    *,
+    window: int = 1,
+    trajectories: TrajectoryIndex | None = None,
+) -> ComponentIndex:
+    """Finds the rows at which windows start, by the components that they have.
+
+    All rows of such a window belong to one trajectory, and the component holds neither
+    the action nor a fixed entity in any of them. The index takes 4 bytes for each pair
+    of row and component, while it is built 24.
+
+    Args:
+        graphs (torch.Tensor): ``[T, N + 1, N]``, NaN where a row was not scored.
+        threshold (float): the largest score of what is no link, θ.
+        fixed (torch.Tensor): bool ``[N]``, entities that are never swapped.
+
+    Keyword Args:
+        window (int): rows a window. Defaults to 1.
+        trajectories (TrajectoryIndex, optional): needed for windows of several rows.
+
+    Returns:
+        ComponentIndex: the rows of every component.
+
+    Raises:
+        ValueError: a score is infinite.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.components import component_starts
+        >>> graphs = torch.zeros(3, 3, 2)
+        >>> graphs[0, 0, 1] = 1.0  # the entities 0 and 1 are one component
+        >>> index = component_starts(graphs, 0.2, torch.tensor([False, False]))
+        >>> index.masks, index.starts
+        (tensor([1, 2, 3]), tensor([1, 2, 1, 2, 0], dtype=torch.int32))
+    """
+    length, _, entities = graphs.shape
+    device = graphs.device
+    if window > 1 and trajectories is None:
+        raise ValueError("windows of several rows need the trajectories of the storage")
+    oldest = 0 if trajectories is None else trajectories.oldest
+    dtype = torch.int32 if length < 1 << 31 else torch.int64
+    never = _packed(fixed.to(device))
+    step = min(_CHUNK, max(window, _CHUNK_ELEMENTS // (entities * (entities + 1))))
+    masks = [torch.empty(0, dtype=torch.int64, device=device)]
+    starts = [torch.empty(0, dtype=dtype, device=device)]
+    for begin in range(0, length - window + 1, step):
+        end = min(begin + step + window - 1, length)
+        rows = (torch.arange(begin, end, device=device) + oldest) % length
+        part = graphs[rows]
+        if torch.isinf(part).any():
+            row = int(rows[torch.isinf(part).flatten(1).any(1).nonzero()[0, 0]])
+            raise ValueError(
+                f"the graphs of the donors are infinite in row {row}: score the buffer "
+                "anew with score_buffer(..., overwrite=True)"
+            )
+        links, held = _links(part, threshold)
+        joined = _joined(_slid(links, window), _slid(held, window) | never)
+        rows = rows[: joined.shape[0]]
+        leads = _leads(joined)
+        if window > 1 and trajectories is not None:
+            leads &= (trajectories.remaining(rows) >= window - 1).unsqueeze(-1)
+        masks.append(joined[leads])
+        starts.append(rows.to(dtype).unsqueeze(-1).expand_as(leads)[leads])
+    found, order = torch.cat(masks).sort(stable=True)
+    rows = torch.cat(starts)[order]
+    if not len(found):  # an index needs a component to point at; 0 is none
+        found, rows = found.new_zeros(1), rows.new_zeros(1)
+    unique, size = torch.unique_consecutive(found, return_counts=True)
+    return ComponentIndex(unique, rows, size.cumsum(0) - size, size)
+
+
+class ComponentDonors(BufferDonors):
+    """A replay buffer whose windows donate components.
+
+    As :class:`~torchrl_caiac.transforms.donors.BufferDonors`, with graphs in
+    ``score_key`` and bit masks in the place of free entities.
+    """
+
+    _what: ClassVar[str] = "graphs"
+    _key_argument: ClassVar[str] = "graph_key"
+
+    @property
+    def feature_shape(self) -> tuple[int, ...]:
+        """The shape of one row's graph, ``(N + 1, N)``."""
+        return len(self.layout) + 1, len(self.layout)
+
+    def _eligible(
+        self, scores: torch.Tensor, trajectories: TrajectoryIndex | None
+    ) -> ComponentIndex:
+        return component_starts(
+            scores,
+            self.threshold,
+            self.layout.fixed_mask,
+            window=self.window,
+            trajectories=trajectories,
+        )
+
+    def _choose(self, free: torch.Tensor, index: Any, **kwargs: Any) -> SwapDraw:
+        return draw_buffer_components(free, index, **kwargs)
+
+    def draw(
+        self,
+        free: torch.Tensor,
+        *,
+        swap_prob: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> SwapDraw:
+        """Draws donors, and the goals of donor windows.
+
+        Args:
+            free (torch.Tensor): int64 ``[C, N]``, the components that may be swapped.
+
+        Keyword Args:
+            swap_prob (float): probability of swapping a component. Defaults to 1.
+            generator (torch.Generator, optional): source of randomness.
+
+        Returns:
+            SwapDraw: donors and goals as rows of the donor storage, the same for all
+            entities of a component.
+        """
+        draw = super().draw(free, swap_prob=swap_prob, generator=generator)
+        if draw.goal_rows is None:
+            return draw
+        leader = _leader(free).to(draw.goal_rows.device)
+        return draw._replace(goal_rows=draw.goal_rows.gather(1, leader))

@@ -1,0 +1,277 @@
+"""Goals from the future of a trajectory: what goals of all kinds share."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import TensorStorage
+from torchrl.data.replay_buffers import SampleUnit
+from torchrl.envs.transforms import Transform
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms.donors import (
+    StorageCache,
+    TrajectoryIndex,
+    _plain,
+    _rand,
+    _take,
+    goal_columns,
+    trajectory_index,
+)
+
+__all__ = ["FutureGoal", "draw_goal_offset"]
+
+
+def draw_goal_offset(
+    remaining: torch.Tensor,
+    mixture: Mapping[str, float],
+    *,
+    p: float = 0.3,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Draws how many rows beyond a window the row lies whose next state is its goal.
+
+    Offset 0 is the window's last row, whose next state is the first one after the
+    window. Three strategies are mixed, window by window: ``last`` takes the
+    trajectory's last row, ``uniform`` any row from the window's last one on, and
+    ``geometric`` the state ``k >= 1`` steps after the window's last one with
+    probability ``p * (1 - p) ** (k - 1)``, or the last one if the trajectory ends
+    before.
+
+    Args:
+        remaining (torch.Tensor): int64 ``[*]``, rows of the trajectory after the
+            window.
+        mixture (mapping of str to float): the weight of each strategy.
+
+    Keyword Args:
+        p (float): the parameter of ``geometric``, in (0, 1]. Defaults to 0.3.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.future_goal import draw_goal_offset
+        >>> draw_goal_offset(torch.tensor([4, 0]), {"last": 1.0})
+        tensor([4, 0])
+    """
+    weights = {name: weight for name, weight in mixture.items() if weight > 0}
+    shape, device = remaining.shape, remaining.device
+    chance = None
+    if set(weights) != {"last"}:
+        chance = _rand(
+            torch.rand, (2, *shape), device=device, generator=generator
+        ).double()
+    offset = remaining
+    below, total = 0.0, sum(weights.values())
+    for name, weight in weights.items():
+        if name == "last" or chance is None:
+            drawn = remaining
+        elif name == "uniform":
+            drawn = (chance[1] * (remaining + 1)).long()
+        else:
+            # Inverse of the distribution function, from u in [0, 1).
+            drawn = _geometric(chance[1], p)
+        drawn = torch.minimum(drawn, remaining)
+        if chance is None or below == 0.0:
+            offset = drawn
+        else:
+            offset = torch.where(chance[0] >= below / total, drawn, offset)
+        below += weight
+    return offset
+
+
+def _geometric(u: torch.Tensor, p: float) -> torch.Tensor:
+    if p >= 1.0:
+        return torch.zeros_like(u, dtype=torch.int64)
+    return (torch.log1p(-u) / math.log1p(-p)).long()
+
+
+class FutureGoal(Transform, SampleUnit):
+    """Reads goals from a storage and hands them from ``expand`` to ``forward``.
+
+    The base of :class:`~torchrl_caiac.transforms.WindowGoal` and
+    :class:`~torchrl_caiac.transforms.HindsightGoal`, which are both the
+    ``sample_unit`` of a replay buffer and one of its transforms.
+
+    Args:
+        layout (EntityLayout): the entities and their goals.
+
+    Keyword Args:
+        p (float): the parameter of the geometric distribution.
+        trajectory_key (NestedKey): trajectory ids in the storage.
+        done_key (NestedKey): end flags, read where there are no ids.
+        counterfactual_key (NestedKey): the mark of counterfactual rows.
+        generator (torch.Generator, optional): source of randomness.
+
+    Raises:
+        TypeError: an argument has the wrong type.
+        ValueError: ``p`` is out of range, or the layout has no goals.
+    """
+
+    def __init__(
+        self,
+        layout: EntityLayout,
+        *,
+        p: float,
+        trajectory_key: NestedKey,
+        done_key: NestedKey,
+        counterfactual_key: NestedKey,
+        generator: torch.Generator | None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(layout, EntityLayout):
+            raise TypeError(f"layout is an EntityLayout, got {type(layout).__name__}")
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise TypeError(
+                f"generator is a torch.Generator, got {type(generator).__name__}"
+            )
+        if not 0 < p <= 1:
+            raise ValueError(f"p, of the geometric strategy, lies in (0, 1], got {p!r}")
+        if not any(layout.goal.values()):
+            raise ValueError(
+                "the layout has no goals: give EntityLayout(..., goal=..., "
+                "achieved=...)"
+            )
+        if not layout.is_flat:
+            blind = [
+                name
+                for name, key in layout.goal.items()
+                if key is not None and layout.achieved.get(name) is None
+            ]
+            if blind:
+                raise ValueError(
+                    f"the layout does not say where the achieved goals of {blind} lie: "
+                    "give EntityLayout.from_keys(..., achieved=...)"
+                )
+        self.layout = layout
+        self.p = float(p)
+        self.trajectory_key = unravel_key(trajectory_key)
+        self.done_key = unravel_key(done_key)
+        self.counterfactual_key = unravel_key(counterfactual_key)
+        self.generator = generator
+        self._reset_state()
+
+    def _reset_state(self) -> None:
+        # By thread: a buffer prefetches in threads, and draws and applies in the same.
+        self._pending = threading.local()
+        self._cache = StorageCache(self._trajectories)
+
+    def _trajectories(self, storage: TensorStorage) -> TrajectoryIndex:
+        return trajectory_index(
+            storage, trajectory_key=self.trajectory_key, done_key=self.done_key
+        )
+
+    def set_generator(self, generator: torch.Generator | None) -> None:
+        """Sets the source of randomness.
+
+        Args:
+            generator (torch.Generator, optional): ``None`` for torch's default one.
+        """
+        self.generator = generator
+
+    # --- reading ---------------------------------------------------------------------
+
+    def _flat_source(self, data: TensorDictBase) -> tuple[torch.Tensor, list[int]]:
+        layout = self.layout
+        if layout.achieved:
+            key: NestedKey = layout.next(layout.observation_key)
+            columns = goal_columns(layout)
+        else:
+            key = layout.next(layout.achieved_goal_key)
+            columns = list(range(layout.goal_width))
+        source = data.get(key, None)
+        if source is None:
+            raise KeyError(
+                f"goals are read from {key!r}, which the data lacks: give the layout "
+                "`achieved` columns, or store the achieved goals"
+            )
+        if source.ndim != 2 or source.shape[-1] <= max(columns):
+            raise ValueError(
+                f"{key!r} has {source.shape[-1]} columns in {source.ndim} dimensions, "
+                f"but the layout's goals need [T, D] with at least {max(columns) + 1}: "
+                "correct the layout, or the data"
+            )
+        return _plain(source), columns
+
+    def _nested_source(self, data: TensorDictBase, name: str) -> Any:
+        key = self.layout.next(self.layout.achieved[name])
+        source = data.get(key, None)
+        if source is None:
+            raise KeyError(
+                f"the goals of {name!r} are read from {key!r}, which the data lacks: "
+                "correct `achieved` in EntityLayout.from_keys"
+            )
+        return _plain(source) if isinstance(source, torch.Tensor) else source
+
+    def read_goals(
+        self, data: TensorDictBase, rows: torch.Tensor | None = None
+    ) -> dict[NestedKey, torch.Tensor]:
+        """Reads the goals that the next states of rows achieve.
+
+        Args:
+            data (TensorDictBase): what ``rows`` are rows of, ``[T]``.
+            rows (torch.Tensor, optional): int64 ``[M]``; all rows by default.
+
+        Returns:
+            dict: the goals ``[M, ...]`` by the desired-goal leaf they belong in, in
+            layout order.
+
+        Raises:
+            KeyError: the data lacks the leaf that goals are read from.
+        """
+        layout = self.layout
+        if layout.is_flat:
+            source, columns = self._flat_source(data)
+            where = layout._index_tensor("goal", columns, source.device)
+            if rows is None:
+                goals = source.index_select(-1, where)
+            else:
+                places = rows.to(source.device).unsqueeze(-1) * source.shape[-1] + where
+                goals = _take(source, places, where)
+            return {layout.desired_goal_key: goals}
+        found: dict[NestedKey, torch.Tensor] = {}
+        for name in layout.names:
+            key = layout.goal.get(name)
+            if key is None:
+                continue
+            source = self._nested_source(data, name)
+            if isinstance(source, torch.Tensor):
+                found[key] = source
+                continue
+            for below in sorted(map(_path, source.keys(True, True))):
+                found[(*_path(key), *below)] = _plain(source.get(below))
+        if rows is not None:
+            found = {key: leaf[rows.to(leaf.device)] for key, leaf in found.items()}
+        return found
+
+    # --- copying ---------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.extra_repr()})"
+
+    def clone(self) -> FutureGoal:
+        """A copy with its own pending goals."""
+        clone: FutureGoal = super().clone()
+        clone._reset_state()
+        return clone
+
+    def __getstate__(self) -> dict[str, Any]:
+        state: dict[str, Any] = super().__getstate__()
+        del state["_pending"], state["_cache"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._reset_state()
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else tuple(key)

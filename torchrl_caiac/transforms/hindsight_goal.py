@@ -1,0 +1,529 @@
+"""Hindsight goals for transitions: relabelling beside counterfactuals (A.5.2)."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms.donors import (
+    RewardFn,
+    _number,
+    _rand,
+    _storage_td,
+    call_reward,
+    stored_reward,
+)
+from torchrl_caiac.transforms.future_goal import FutureGoal, draw_goal_offset
+
+__all__ = ["HindsightDraw", "HindsightGoal", "take_back"]
+
+Goals = dict[NestedKey, torch.Tensor]
+
+
+class HindsightDraw(NamedTuple):
+    """What was drawn for one batch of ``B`` rows: where each desired goal comes from.
+
+    Attributes:
+        source (torch.Tensor): int64 ``[B]``. Below ``B``: the row's own desired goal;
+            ``B + i``: the next achieved goal of row ``i`` of the batch; ``2 B + i``:
+            the future goal of row ``i``.
+        future (dict, optional): the future goals ``[B, ...]`` by desired-goal leaf.
+    """
+
+    source: torch.Tensor
+    future: Mapping[NestedKey, torch.Tensor] | None = None
+
+
+class HindsightGoal(FutureGoal):
+    """Relabels the goals of transitions, real and counterfactual ones (A.5.2).
+
+    Rows that are not marked as counterfactual get, with probability ``future``, a goal
+    that was achieved later in their own trajectory and, with probability ``random``,
+    the goal that a random real row of the batch achieves. Rows that are marked get,
+    with probability ``counterfactual``, the goal that a random counterfactual row of
+    the batch achieves after swapping. All other rows keep their desired goals.
+    "Achieves" means the next state: goals are read as by
+    :class:`~torchrl_caiac.transforms.WindowGoal`, so that a row whose goal is its own
+    next achieved goal is a success.
+
+    Rewards of relabelled rows are made anew by ``reward_fn`` from the row's *next*
+    achieved goal, and so are those of counterfactual rows, so that
+    :class:`~torchrl_caiac.CAIACTransform` needs no ``reward_fn`` of its own. End flags
+    stay as they were stored: this is meant for tasks that do not end at their goal.
+
+    Append it behind the augmentation. Before it, it works too: the augmentation takes
+    the relabelling back, swaps the stored goals, and has it done again.
+
+    Where ``future`` is not 0, the same object is the buffer's ``sample_unit``, in
+    which it sees the sampled rows and draws goals from the storage. Where it is 0 the
+    batch is enough, and a :class:`~torchrl.data.HERReplayBuffer` can do the relabelling
+    of real rows, see :meth:`her_reward`.
+
+    The paper's arms, with half of each batch counterfactual:
+
+    ==================  ==========================================================
+    ``caiac``           ``CAIACTransform(layout)``, ``HindsightGoal(layout, r)``
+    ``relabel_only``    ``CAIACTransform(layout, swap_prob=0.0)``,
+                        ``HindsightGoal(layout, r)``: the same rows are relabelled
+                        as counterfactuals, nothing is swapped
+    ``none``            ``HindsightGoal(layout, r, random=0.25)`` alone: the share of
+                        random goals that the other arms have
+    ==================  ==========================================================
+
+    Args:
+        layout (EntityLayout): the entities and their goals.
+        reward_fn (callable): ``(next_achieved [B, G], desired [B, G])`` to rewards
+            ``[B]`` or ``[B, 1]``. A nested layout's goals are laid side by side,
+            flattened, in layout order.
+
+    Keyword Args:
+        future (float): share of real rows with a goal of their future. Defaults to
+            0.5.
+        random (float): share of real rows with a goal of another row; ``future`` and
+            it are at most 1 together. Defaults to 0.
+        counterfactual (float): share of counterfactual rows with a goal of
+            counterfactual rows. Defaults to 0.5.
+        strategy (str): how future goals are drawn. ``"geometric"``: the state
+            ``k >= 1`` steps after the row's own with probability
+            ``p * (1 - p) ** (k - 1)``, or the trajectory's last one; ``"uniform"``: any
+            later state. Defaults to ``"geometric"``.
+        p (float): the parameter of ``"geometric"``. Defaults to 0.2.
+        trajectory_key (NestedKey): trajectory ids in the storage. Defaults to
+            ``"episode"``; without such a leaf, trajectories end at ``done_key``.
+        done_key (NestedKey): end flags. Defaults to ``("next", "done")``.
+        reward_key (NestedKey): the rewards, ``[B]`` or ``[B, 1]``. Defaults to
+            ``("next", "reward")``.
+        counterfactual_key (NestedKey): the augmentation's mark, bool ``[B, 1]``.
+            Defaults to ``("caiac", "counterfactual")``.
+        relabeled_key (NestedKey): where to write which rows got another goal, bool
+            ``[B, 1]``. Defaults to ``("hindsight", "relabeled")``.
+        generator (torch.Generator, optional): source of randomness; torch's default
+            generator without it. The same state gives the same batch.
+
+    Raises:
+        TypeError: an argument has the wrong type.
+        ValueError: an argument is out of range, or the layout has no goals.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.transforms import HindsightGoal
+        >>> layout = EntityLayout(
+        ...     {"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]}
+        ... )
+        >>> def reward(achieved, desired):
+        ...     return -(achieved != desired).any(-1).float()
+        >>> goals = HindsightGoal(layout, reward, future=1.0, p=1.0)  # the next state
+        >>> rb = ReplayBuffer(
+        ...     storage=LazyTensorStorage(8), sample_unit=goals, batch_size=3
+        ... )
+        >>> rb.append_transform(goals)  # doctest: +ELLIPSIS
+        ReplayBuffer(...)
+        >>> state = torch.arange(8.0).unsqueeze(-1)
+        >>> _ = rb.extend(TensorDict({
+        ...     "observation": state, "desired_goal": -torch.ones(8, 1),
+        ...     "episode": torch.zeros(8, dtype=torch.int64),
+        ...     "next": {"observation": state + 1, "reward": -torch.ones(8, 1)}}, [8]))
+        >>> batch = rb.sample()
+        >>> (batch["desired_goal"] - batch["observation"]).flatten()
+        tensor([1., 1., 1.])
+        >>> batch["next", "reward"].flatten()
+        tensor([-0., -0., -0.])
+    """
+
+    def __init__(
+        self,
+        layout: EntityLayout,
+        reward_fn: RewardFn,
+        *,
+        future: float = 0.5,
+        random: float = 0.0,
+        counterfactual: float = 0.5,
+        strategy: Literal["geometric", "uniform"] = "geometric",
+        p: float = 0.2,
+        trajectory_key: NestedKey = "episode",
+        done_key: NestedKey = ("next", "done"),
+        reward_key: NestedKey = ("next", "reward"),
+        counterfactual_key: NestedKey = ("caiac", "counterfactual"),
+        relabeled_key: NestedKey = ("hindsight", "relabeled"),
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__(
+            layout,
+            p=p,
+            trajectory_key=trajectory_key,
+            done_key=done_key,
+            counterfactual_key=counterfactual_key,
+            generator=generator,
+        )
+        if not callable(reward_fn):
+            raise TypeError(
+                "reward_fn is a function of the next achieved and the desired goals, "
+                f"got {type(reward_fn).__name__}"
+            )
+        if strategy not in ("geometric", "uniform"):
+            raise ValueError(f"strategy is 'geometric' or 'uniform', got {strategy!r}")
+        self.reward_fn = reward_fn
+        self.future = _number("future", future, 1.0)
+        self.random = _number("random", random, 1.0)
+        self.counterfactual = _number("counterfactual", counterfactual, 1.0)
+        if self.future + self.random > 1.0:
+            raise ValueError(
+                "future and random are shares of the real rows, at most 1 together; "
+                f"got {future!r} and {random!r}"
+            )
+        self.strategy = strategy
+        self.reward_key = unravel_key(reward_key)
+        self.relabeled_key = unravel_key(relabeled_key)
+
+    # --- drawing ---------------------------------------------------------------------
+
+    def expand(
+        self,
+        index: torch.Tensor | tuple[torch.Tensor, ...],
+        info: dict[str, Any],
+        storage: Any,
+    ) -> tuple[torch.Tensor | tuple[torch.Tensor, ...], dict[str, Any]]:
+        """Draws and reads a future goal for each sampled row; the rows stay.
+
+        Args:
+            index (torch.Tensor): the sampled rows ``[B]``.
+            info (dict): the sampler's information, returned as it is.
+            storage (TensorStorage): what is sampled.
+
+        Returns:
+            tuple: ``index`` and ``info``.
+        """
+        if self.future > 0:
+            data = _storage_td(storage, "the buffer")
+            trajectories = self._cache.get(storage)
+            rows = index[0] if isinstance(index, tuple) else index
+            rows = rows.reshape(-1).to(trajectories.ends.device)
+            offset = draw_goal_offset(
+                trajectories.remaining(rows),
+                {self.strategy: 1.0},
+                p=self.p,
+                generator=self.generator,
+            )
+            self._pending.goals = self.read_goals(
+                data, (rows + offset) % trajectories.length
+            )
+        return index, info
+
+    def generate_parameters(
+        self,
+        counterfactual: torch.Tensor,
+        future: Mapping[NestedKey, torch.Tensor] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> HindsightDraw:
+        """Draws which rows are relabelled, and from where.
+
+        Args:
+            counterfactual (torch.Tensor): bool ``[B, 1]``, the augmentation's mark.
+            future (mapping, optional): future goals ``[B, ...]`` by desired-goal leaf;
+                needed where :attr:`future` is not 0.
+            generator (torch.Generator, optional): source of randomness; the
+                transform's own by default.
+
+        Returns:
+            HindsightDraw: the draw.
+        """
+        generator = self.generator if generator is None else generator
+        marks = counterfactual.reshape(-1)
+        rows, device = marks.shape[0], marks.device
+        chance, pick = _rand(
+            torch.rand, (2, rows), device=device, generator=generator
+        ).double()
+        own = torch.arange(rows, device=device)
+        # Real rows first: each kind draws among the places that it takes up.
+        order = torch.argsort(marks.byte(), stable=True)
+        real = rows - marks.sum()
+        place = torch.where(marks, real + pick * (rows - real), pick * real).long()
+        share = torch.where(marks, self.counterfactual, self.future + self.random)
+        source = torch.where(chance < share, order[place] + rows, own)
+        if self.future > 0:
+            if future is None:
+                raise ValueError(
+                    f"future goals are wanted for a share of {self.future} of the real "
+                    "rows, and none are given"
+                )
+            later = (chance < self.future) & ~marks
+            source = torch.where(later, own + 2 * rows, source)
+        return HindsightDraw(source, future)
+
+    # --- applying --------------------------------------------------------------------
+
+    def _desired(
+        self, td: TensorDictBase, key: NestedKey, achieved: torch.Tensor
+    ) -> torch.Tensor:
+        desired = td.get(key, None)
+        if desired is None:
+            raise KeyError(
+                f"the batch has no desired goals in {key!r}: store them, or correct "
+                "the layout's desired-goal key"
+            )
+        if desired.shape != achieved.shape:
+            raise ValueError(
+                f"{key!r} has shape {list(desired.shape)}, but the goals that are "
+                f"achieved have {list(achieved.shape)}: correct the layout's goals, or "
+                "the data"
+            )
+        return desired
+
+    def _relabel(self, td: TensorDictBase, draw: HindsightDraw) -> Goals:
+        """The leaves that a draw changes or adds."""
+        relabeled = (draw.source >= td.shape[0]).unsqueeze(-1)
+        marks = td.get(self.counterfactual_key, None)
+        achieved = self.read_goals(td)
+        goals: Goals = {}
+        for key, reached in achieved.items():
+            desired = self._desired(td, key, reached)
+            parts = [desired, reached.to(desired)]
+            if draw.future is not None:
+                parts.append(draw.future[key].to(desired))
+            goals[key] = torch.cat(parts).index_select(0, draw.source)
+        old = stored_reward(td, self.reward_key)
+        reward = call_reward(self.reward_fn, _vector(achieved), _vector(goals), old)
+        anew = relabeled if marks is None else relabeled | marks
+        after = {self.layout.next(key): goal for key, goal in goals.items()}
+        return {
+            **goals,
+            **{k: goal for k, goal in after.items() if td.get(k, None) is not None},
+            self.reward_key: torch.where(anew.view_as(old), reward, old),
+            self.relabeled_key: relabeled,
+        }
+
+    def apply_parameters(
+        self, tensordict: TensorDictBase, draw: HindsightDraw
+    ) -> TensorDictBase:
+        """Applies a draw: the same draw gives the same batch.
+
+        Args:
+            tensordict (TensorDictBase): the batch ``[B]``; it stays as it is.
+            draw (HindsightDraw): from :meth:`generate_parameters`.
+
+        Returns:
+            TensorDictBase: a shallow copy with goals, also under ``next`` where the
+            batch has them there, rewards and the mark of relabelled rows.
+
+        Raises:
+            KeyError: goals or rewards are missing.
+            ValueError: goals or rewards have the wrong shape.
+        """
+        return _with(tensordict, self._relabel(tensordict, draw))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Relabels a batch.
+
+        Args:
+            tensordict (TensorDictBase): the batch ``[B]``.
+
+        Returns:
+            TensorDictBase: a shallow copy with new leaves; the input stays as it is.
+
+        Raises:
+            RuntimeError: no future goals were drawn for this batch, or it was
+                relabelled already.
+            KeyError: goals or rewards are missing.
+            ValueError: goals or rewards have the wrong shape.
+        """
+        goals = self._pending.__dict__.pop("goals", None)
+        if tensordict.ndim != 1:
+            raise ValueError(
+                f"the batch has shape {list(tensordict.shape)}, wanted [B]: sample "
+                "flat batches of transitions"
+            )
+        rows = tensordict.shape[0]
+        if self.future > 0:
+            if goals is None:
+                raise RuntimeError(
+                    "no future goals were drawn for this batch: pass the same "
+                    "HindsightGoal as sample_unit=... of the replay buffer, and get "
+                    "data by rb.sample(); or give future=0, where goals of the batch "
+                    "are enough"
+                )
+            for goal in goals.values():
+                if goal.shape[0] != rows:
+                    raise RuntimeError(
+                        f"future goals were drawn for {goal.shape[0]} rows, but the "
+                        f"batch has {rows}: append HindsightGoal before transforms "
+                        "that change the batch size"
+                    )
+        if tensordict.get(self.relabeled_key, None) is not None:
+            raise RuntimeError(
+                f"the batch is relabelled already, as {self.relabeled_key!r} says: "
+                "append one HindsightGoal only"
+            )
+        marks = tensordict.get(self.counterfactual_key, None)
+        if marks is not None and marks.shape != (rows, 1):
+            raise ValueError(
+                f"{self.counterfactual_key!r} has shape {list(marks.shape)}, wanted "
+                f"[{rows}, 1]"
+            )
+        augmented = marks is not None
+        if marks is None:
+            device = stored_reward(tensordict, self.reward_key).device
+            marks = torch.zeros(rows, 1, dtype=torch.bool, device=device)
+        draw = self.generate_parameters(marks, goals)
+        leaves = self._relabel(tensordict, draw)
+        if not augmented:
+            # An augmentation may follow, which swaps goals as they were stored.
+            stored = {key: tensordict.get(key, None) for key in leaves}
+            _early.relabeling = _Early(self, goals, stored, leaves)
+        return _with(tensordict, leaves)
+
+    def her_reward(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """The reward function for a :class:`~torchrl.data.HERReplayBuffer`.
+
+        That buffer relabels the *first* ``int(her_ratio * B)`` rows of a batch after
+        all transforms, from a uniformly drawn later row of the trajectory. With
+        ``her_ratio`` at most ``1 - counterfactual_ratio`` these are real rows, and a
+        ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones behind
+        them. The mark in :attr:`relabeled_key` is set for both. That buffer knows
+        trajectories by their end flags only, and in TorchRL 0.14 it must not be
+        written to once it is full.
+
+        Args:
+            tensordict (TensorDictBase): the rows that the buffer relabelled.
+
+        Returns:
+            torch.Tensor: their rewards, shape and dtype as stored.
+
+        Raises:
+            ValueError: there are counterfactual rows among them.
+
+        Examples:
+            >>> import torch
+            >>> from tensordict import TensorDict
+            >>> from torchrl.data import HERReplayBuffer, LazyTensorStorage
+            >>> from torchrl_caiac import CAIACTransform, EntityLayout
+            >>> from torchrl_caiac.transforms import HindsightGoal
+            >>> layout = EntityLayout(
+            ...     {"cup": [0], "box": [1]}, goal={"cup": [0], "box": [1]}
+            ... )
+            >>> def reward(achieved, desired):
+            ...     return -(achieved != desired).any(-1).float()
+            >>> goals = HindsightGoal(layout, reward, future=0.0)
+            >>> rb = HERReplayBuffer(
+            ...     goals.her_reward, her_ratio=0.25, batch_size=8,
+            ...     achieved_goal_key=("next", "achieved_goal"),
+            ...     storage=LazyTensorStorage(20),
+            ... )
+            >>> _ = rb.append_transform(CAIACTransform(layout))
+            >>> _ = rb.append_transform(goals)
+            >>> state, end = torch.rand(20, 2), torch.zeros(20, 1, dtype=torch.bool)
+            >>> _ = rb.extend(TensorDict({
+            ...     "observation": state, "achieved_goal": state,
+            ...     "desired_goal": torch.zeros(20, 2),
+            ...     "next": {"observation": state, "achieved_goal": state,
+            ...         "reward": -torch.ones(20, 1), "done": end},
+            ...     ("caiac", "score"): torch.zeros(20, 2)}, [20]))
+            >>> rb.sample()["hindsight", "relabeled"][:4].flatten()
+            tensor([ True,  True, False, False])
+        """
+        marks = tensordict.get(self.counterfactual_key, None)
+        if marks is not None and marks.any():
+            raise ValueError(
+                f"HERReplayBuffer relabels the first {tensordict.shape[0]} rows of the "
+                f"batch, {int(marks.sum())} of which are counterfactual and have no "
+                "future of their own: give it a her_ratio of at most "
+                "1 - counterfactual_ratio"
+            )
+        achieved = self.read_goals(tensordict)
+        desired = {
+            key: self._desired(tensordict, key, goal) for key, goal in achieved.items()
+        }
+        relabeled = tensordict.get(self.relabeled_key, None)
+        if relabeled is not None:
+            relabeled.fill_(True)  # a view of the batch's mark, like all of these rows
+        return call_reward(
+            self.reward_fn,
+            _vector(achieved),
+            _vector(desired),
+            stored_reward(tensordict, self.reward_key),
+        )
+
+    def extra_repr(self) -> str:
+        """The arguments, for ``repr``."""
+        return (
+            f"future={self.future}, random={self.random}, "
+            f"counterfactual={self.counterfactual}, strategy={self.strategy!r}, "
+            f"p={self.p}"
+        )
+
+
+def _with(td: TensorDictBase, leaves: Goals) -> TensorDictBase:
+    out = td.copy()
+    for key, leaf in leaves.items():
+        out.set(key, leaf)
+    return out
+
+
+def _vector(goals: Goals) -> torch.Tensor:
+    leaves = list(goals.values())
+    if len(leaves) == 1 and leaves[0].ndim == 2:
+        return leaves[0]
+    return torch.cat([leaf.reshape(len(leaf), -1) for leaf in leaves], -1)
+
+
+# --- relabelling before the augmentation ---------------------------------------------
+
+
+class _Early(NamedTuple):
+    """A relabelling that an augmentation behind it has to take back."""
+
+    transform: HindsightGoal
+    future: Goals | None
+    stored: dict[NestedKey, torch.Tensor | None]
+    written: Goals
+
+
+# The last one of this thread: the transforms of a buffer run one after the other.
+_early = threading.local()
+
+
+def take_back(
+    tensordict: TensorDictBase, relabeled_key: NestedKey
+) -> tuple[TensorDictBase, HindsightGoal | None]:
+    """Takes the relabelling of a batch back, for an augmentation that comes later.
+
+    Args:
+        tensordict (TensorDictBase): the batch; it stays as it is.
+        relabeled_key (NestedKey): the mark of relabelled rows.
+
+    Returns:
+        tuple: the batch with its goals and rewards as they were stored, and the
+        transform that has to be called on the augmented batch; ``None`` where the
+        batch was not relabelled.
+
+    Raises:
+        RuntimeError: the goals were changed since.
+    """
+    mark = tensordict.get(relabeled_key, None)
+    if mark is None:
+        return tensordict, None
+    early: _Early | None = _early.__dict__.pop("relabeling", None)
+    if early is None or any(
+        tensordict.get(key, None) is not leaf for key, leaf in early.written.items()
+    ):
+        raise RuntimeError(
+            "HindsightGoal relabelled this batch, and a transform changed its goals "
+            "or rewards since, so that they cannot be swapped as they were stored: "
+            "append HindsightGoal behind the augmentation"
+        )
+    out = tensordict.copy()
+    for key, leaf in early.stored.items():
+        if leaf is None:
+            del out[key]
+        else:
+            out.set(key, leaf)
+    early.transform._pending.goals = early.future
+    return out, early.transform
