@@ -172,3 +172,48 @@ def test_bad_input(model, solver):
         InverseKinematics(model, "tip", ["a", "b"], limits=[(0, 1)])
     with pytest.raises(ValueError, match="finite"):
         solver.solve(start(model), (np.nan, 0, 0))
+
+
+def test_clearance_counts_what_is_near(model):
+    solver = InverseKinematics(model, "tip", ["a", "b", "c"])
+    # Straight up the plane: the last link's capsule ends at 2.45, the wall begins at
+    # 2.5.
+    qpos = start(model, (np.pi / 2, 0.0, 0.0))
+    assert not solver.in_collision(qpos)
+    assert not solver.in_collision(qpos, clearance=0.04)
+    assert solver.in_collision(qpos, clearance=0.06)
+    # Neighbouring links are near one another and do not count.
+    assert not solver.in_collision(start(model, (0.0, 0.0, 0.0)), clearance=0.06)
+    assert (model.geom_margin == 0).all()
+
+
+def test_routes_go_round_what_is_in_the_way(model):
+    solver = InverseKinematics(model, "tip", ["a", "b", "c"])
+    # A straight arm comes within 5 cm of the wall.
+    clearance = 0.08
+    right, left = np.array([1.2, 0.0, 0.0]), np.array([1.9, 0.0, 0.0])
+    low, folded = np.array([0.5, 0.0, 0.0]), np.array([1.5, 2.4, 0.0])
+
+    def close(route, begin=right):
+        count = 0
+        for first, last in zip([begin, *route], route, strict=False):
+            samples = round(np.abs(last - first).max() / 0.02)
+            for share in np.linspace(0, 1, samples)[1:]:
+                joints = first + share * (last - first)
+                count += solver.in_collision(start(model, joints), clearance)
+        return count
+
+    free = solver.find_route(start(model, right), low, [folded], clearance=clearance)
+    assert len(free) == 1
+    np.testing.assert_array_equal(free[0], low)
+    assert close([left]) > 0
+    round_ = solver.find_route(
+        start(model, right), left, [low, folded], clearance=clearance
+    )
+    np.testing.assert_array_equal(round_, [folded, left])
+    assert close(round_) == 0
+    # No way is free: the one least in the way.
+    near, beyond = np.array([1.65, 0.0, 0.0]), np.array([2.6, 0.0, 0.0])
+    least = solver.find_route(start(model, right), near, [beyond], clearance=clearance)
+    np.testing.assert_array_equal(least, [near])
+    assert close([beyond, near]) > close([near]) > 0

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -172,6 +173,9 @@ class InverseKinematics:
         self._moved[model.jnt_bodyid[ids]] = True
         for body in range(1, model.nbody):
             self._moved[body] |= self._moved[model.body_parentid[body]]
+        # With its base, which the arm is always close to.
+        self._robot = np.isin(model.body_rootid, model.body_rootid[self._moved])
+        self._margins: dict[float, Any] = {}
         self.damping = damping
         self.rotation_weight = rotation_weight
         self.iterations = iterations
@@ -376,21 +380,81 @@ class InverseKinematics:
             )
         return best
 
-    def in_collision(self, qpos: ArrayLike) -> bool:
+    def find_route(
+        self,
+        qpos: ArrayLike,
+        target: ArrayLike,
+        via: Iterable[ArrayLike],
+        *,
+        clearance: float = 0.02,
+        spacing: float = 0.15,
+    ) -> list[NDArray[np.float64]]:
+        """Choose a way through joint space: straight, or by one posture of several.
+
+        Args:
+            qpos: positions of the whole model, `[nq]`, where the way begins.
+            target: joint positions `[J]` where it ends.
+            via: joint positions `[J]` each, by which it may go.
+
+        Keyword Args:
+            clearance: distance to keep from what is not the robot, metres.
+            spacing: largest change of a joint between two configurations that are
+                looked at, radians.
+
+        Returns:
+            the postures to go to, one after the other, the last of them `target`: of
+            all ways the one with the fewest configurations that are too close, and
+            of those the shortest.
+        """
+        configuration = np.array(qpos, dtype=np.float64)
+        begin, end = configuration[self.qpos_index], np.asarray(target, np.float64)
+
+        def leg(first: NDArray[np.float64], last: NDArray[np.float64]) -> int:
+            count = int(np.ceil(np.abs(last - first).max() / spacing))
+            close = 0
+            for share in np.arange(1, count + 1) / max(count, 1):
+                configuration[self.qpos_index] = first + share * (last - first)
+                close += self.in_collision(configuration, clearance)
+            return close
+
+        best, best_cost = [end], (leg(begin, end), float(np.abs(end - begin).max()))
+        for posture in via:
+            if best_cost[0] == 0:
+                break
+            middle = np.asarray(posture, dtype=np.float64)
+            length = np.abs(middle - begin).max() + np.abs(end - middle).max()
+            cost = (leg(begin, middle) + leg(middle, end), float(length))
+            if cost < best_cost:
+                best, best_cost = [middle, end], cost
+        return best
+
+    def in_collision(self, qpos: ArrayLike, clearance: float = 0.0) -> bool:
         """Tell whether the solver's part of the robot touches something.
 
         Args:
             qpos: positions of the whole model, `[nq]`.
+            clearance: distance to what is not the robot that counts as touching,
+                metres.
 
         Returns:
             True where a body that the solver's joints move penetrates another body,
-            one of the robot's own included.
+            one of the robot's own included, or is nearer than `clearance` to something
+            that is not the robot.
         """
         self.data.qpos[:] = qpos
         self._mujoco.mj_kinematics(self.model, self.data)
-        self._mujoco.mj_collision(self.model, self.data)
-        for contact in self.data.contact[: self.data.ncon]:
-            bodies = self.model.geom_bodyid[contact.geom]
-            if contact.dist < 0 and self._moved[bodies].any():
-                return True
-        return False
+        self._mujoco.mj_collision(self._with_margin(clearance), self.data)
+        contact = self.data.contact
+        bodies = self.model.geom_bodyid[contact.geom]
+        near = np.where(self._robot[bodies].all(axis=1), 0.0, clearance)
+        return bool((self._moved[bodies].any(axis=1) & (contact.dist < near)).any())
+
+    def _with_margin(self, clearance: float) -> Any:
+        """Return a model whose contacts begin at that distance."""
+        if clearance == 0:
+            return self.model
+        if clearance not in self._margins:
+            model = copy.copy(self.model)
+            model.geom_margin[self._moved[model.geom_bodyid]] = clearance
+            self._margins[clearance] = model
+        return self._margins[clearance]
