@@ -11,6 +11,7 @@ from torchrl_caiac.plotting import (
     bootstrap_interval,
     plot_frames,
     plot_influence,
+    plot_learning_curves,
     plot_success,
 )
 
@@ -135,6 +136,55 @@ class TestSuccess:
             bootstrap_interval([0.0, np.nan])
         with pytest.raises(ValueError, match="confidence"):
             bootstrap_interval([0.0], confidence=95)
+
+
+CURVES = {
+    "none": ([2000, 4000, 6000], [[0.0, 0.1, 0.2], [0.1, 0.1, 0.3], [0.2, 0.4, 0.4]]),
+    "caiac": ([2000, 6000], [[0.2, 0.8]]),
+}
+
+
+class TestLearningCurves:
+    def test_lines_are_means_with_bands(self, tmp_path):
+        figure = plot_learning_curves(
+            CURVES, labels={"caiac": "CAIAC"}, confidence=0.8, xlabel="a", ylabel="b"
+        )
+        axes = figure.axes[0]
+        assert legend(figure) == ["none", "CAIAC"]
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("a", "b")
+        for line, (steps, runs) in zip(axes.lines, CURVES.values(), strict=True):
+            assert line.get_xdata().tolist() == steps
+            assert np.allclose(line.get_ydata(), np.mean(runs, 0))
+        bands = [c.get_paths()[0].vertices for c in axes.collections]
+        runs = np.array(CURVES["none"][1])
+        for x, values in zip(CURVES["none"][0], runs.T, strict=True):
+            ends = bands[0][bands[0][:, 0] == x, 1]
+            expected = bootstrap_interval(values, confidence=0.8)
+            assert (ends.min(), ends.max()) == pytest.approx(expected)
+        # One run tells nothing of others.
+        assert set(bands[1][:, 1].round(9)) == {0.2, 0.8}
+        assert -0.05 < axes.get_ylim()[0] <= 0
+        figure.savefig(tmp_path / "curves.png")
+
+    def test_negative_returns_are_seen(self):
+        figure = plot_learning_curves({"a": ([0, 1], [[-3.0, -1.0]])}, title="returns")
+        assert figure.axes[0].get_ylim()[0] < -3
+        assert figure.axes[0].get_title(loc="left") == "returns"
+
+    @pytest.mark.parametrize(
+        ("curves", "message"),
+        [
+            ({}, "empty"),
+            ({"a": ([1, 2], [0.0, 1.0])}, r"'a' has steps of shape \(2,\).*\[R, P\]"),
+            ({"a": ([1, 2], [[0.0, 1.0, 2.0]])}, r"values of shape \(1, 3\)"),
+            ({"a": ([[1, 2]], [[0.0, 1.0]])}, r"steps of shape \(1, 2\)"),
+            ({"a": ([1, 2], [[0.0, np.nan]])}, "finite"),
+            ({"a": ([1, 2], np.zeros((0, 2)))}, "at least one value"),
+        ],
+    )
+    def test_bad_input(self, curves, message):
+        with pytest.raises(ValueError, match=message):
+            plot_learning_curves(curves)
 
 
 class TestFrames:

@@ -1,4 +1,4 @@
-"""The paper's figures: frames (Fig. 1), success (Fig. 3), influence (Fig. 6)."""
+"""The paper's figures: frames (Fig. 1), success (Figs. 3, 4), influence (Fig. 6)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ __all__ = [
     "bootstrap_interval",
     "plot_frames",
     "plot_influence",
+    "plot_learning_curves",
     "plot_success",
 ]
 
@@ -346,6 +347,81 @@ def plot_success(
     axes.grid(axis="y", color="#E5E5E5", linewidth=0.8)
     figure.legend(
         loc="outside lower center", ncols=min(len(arms), 4), frameon=False, fontsize=9
+    )
+    if title:
+        axes.set_title(title, fontsize=11, loc="left")
+    return figure
+
+
+def plot_learning_curves(
+    curves: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    *,
+    confidence: float = 0.95,
+    labels: Mapping[str, str] | None = None,
+    xlabel: str = "gradient steps",
+    ylabel: str = "success rate",
+    title: str = "",
+) -> Figure:
+    """Draw each arm's mean along training, with bootstrap confidence bands.
+
+    Args:
+        curves: arm to the steps ``[P]`` of its measurements and their values
+            ``[R, P]`` in independent runs.
+
+    Keyword Args:
+        confidence: level of the bands.
+        labels: what to write for an arm instead of its name.
+        xlabel: of the horizontal axis.
+        ylabel: of the vertical axis.
+        title: of the figure.
+
+    Returns:
+        the figure.
+
+    Example:
+        >>> figure = plot_learning_curves(
+        ...     {
+        ...         "none": ([1000, 2000], [[0.0, 0.1], [0.0, 0.2]]),
+        ...         "caiac": ([1000, 2000], [[0.1, 0.4], [0.2, 0.5]]),
+        ...     }
+        ... )
+        >>> figure.axes[0].lines[1].get_ydata().round(3).tolist()
+        [0.15, 0.45]
+    """
+    if not curves:
+        raise ValueError("curves are empty, wanted {arm: (steps [P], values [R, P])}")
+    labels = labels or {}
+    figure = _figure(5.2, 3.4)
+    axes = figure.add_subplot()
+    for n, (arm, (at, values)) in enumerate(curves.items()):
+        steps = np.asarray(at, dtype=np.float64)
+        runs = np.asarray(values, dtype=np.float64)
+        if steps.ndim != 1 or runs.ndim != 2 or runs.shape[1:] != steps.shape:
+            raise ValueError(
+                f"arm {arm!r} has steps of shape {steps.shape} and values of shape "
+                f"{runs.shape}, wanted [P] and [R, P]"
+            )
+        bands = [bootstrap_interval(run, confidence=confidence) for run in runs.T]
+        colour = _COLOURS[n % len(_COLOURS)]
+        axes.plot(
+            steps,
+            runs.mean(0),
+            color=colour,
+            linewidth=1.8,
+            marker="o",
+            markersize=3,
+            label=labels.get(arm, _label(arm)),
+            zorder=3,
+        )
+        low, high = np.reshape(bands, (-1, 2)).T
+        axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+    _plain(axes)
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    axes.grid(axis="y", color="#E5E5E5", linewidth=0.8)
+    figure.legend(
+        loc="outside lower center", ncols=min(len(curves), 4), frameon=False, fontsize=9
     )
     if title:
         axes.set_title(title, fontsize=11, loc="left")

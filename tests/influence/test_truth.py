@@ -1,17 +1,24 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
 from torchrl_caiac import EntityLayout
+from torchrl_caiac.data import offline_buffer
+from torchrl_caiac.envs.fetch_push import FetchPushCubes, FetchPushTruth
+from torchrl_caiac.envs.fetch_push_expert import FetchPushExpert
 from torchrl_caiac.envs.kitchen import KitchenEnv
 from torchrl_caiac.envs.kitchen_expert import KitchenExpert
+from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.influence.truth import (
+    SimulatorInfluence,
     best_threshold,
     draw_actions,
     influence_report,
@@ -112,6 +119,210 @@ class TestTrueInfluence:
     def test_unbounded_actions(self):
         with pytest.raises(ValueError, match="finite"):
             draw_actions([-np.inf], [1.0], 4)
+
+
+class Fenced(Table):
+    """A hand that can only reach what it holds."""
+
+    horizons: ClassVar[set[int]] = set()
+
+    def in_reach(self, state, *, horizon=1):
+        self.horizons.add(horizon)
+        return np.array([True, state[4] > 0, False])
+
+    def outcomes(self, state, actions, *, horizon=1):
+        assert state[4] > 0, "simulated though all is out of reach"
+        return super().outcomes(state, actions, horizon=horizon)
+
+
+def test_what_is_out_of_reach_is_not_simulated():
+    states = [HELD, FREE, HELD, FREE]
+    expected = true_influence(Table(), states, horizon=2, progress=False)
+    spared = true_influence(Fenced(), states, horizon=2, progress=False)
+    assert torch.equal(spared.influenced, expected.influenced)
+    assert torch.equal(spared.displacement[::2], expected.displacement[::2])
+    assert (spared.displacement[1::2] == 0).all()
+    assert Fenced.horizons == {2}
+
+
+class Interrupted(Table):
+    """Notes the states that it is asked about, and is killed at one of them."""
+
+    asked: ClassVar[list[float]] = []
+    last = math.inf
+
+    def outcomes(self, state, actions, *, horizon=1):
+        if state[0] >= self.last:
+            raise KeyboardInterrupt
+        self.asked.append(float(state[0]))
+        return super().outcomes(state, actions, horizon=horizon)
+
+
+@pytest.fixture
+def rows(generator):
+    """Two trajectories, numbered by the hand's position; held at random."""
+    number = torch.arange(9)
+    state = torch.zeros(9, 5, dtype=torch.float64)
+    state[:, 0] = number
+    state[:, 3] = 5
+    state[:, 4] = torch.randint(2, (9,), generator=generator)
+    assert 0 < state[:, 4].sum() < 9
+    return TensorDict(
+        {
+            "observation": state,
+            "info": {"simulator": state},
+            "episode": number // 5,
+            "next": {
+                "observation": state + 1,
+                "done": ((number == 4) | (number == 8))[:, None],
+            },
+        },
+        [9],
+    )
+
+
+class TestSimulatorInfluence:
+    def oracle(self, factory=Table, **kwargs):
+        return SimulatorInfluence(factory, state_key=("info", "simulator"), **kwargs)
+
+    def test_is_the_truth_as_scores(self, rows):
+        states = rows["info", "simulator"]
+        truth = true_influence(Table(), states, progress=False)
+        score = self.oracle()(rows)
+        assert score.dtype == torch.float32
+        assert torch.equal(score, oracle_score(truth.influenced))
+        assert torch.equal(score[:, 1], states[:, 4].float())
+        strict = self.oracle(threshold={"cup": 3.0, "ball": 1e-3})(rows)
+        assert torch.equal(strict, torch.tensor([[1.0, 0, 0]]).expand(9, 3))
+
+    def test_processes_get_the_factory(self, rows, monkeypatch):
+        asked = []
+
+        def recorder(env, states, **kwargs):
+            asked.append((env, kwargs["num_workers"]))
+            return true_influence(env, states, **{**kwargs, "num_workers": 0})
+
+        oracles = [self.oracle(num_workers=n) for n in (0, 3)]
+        monkeypatch.setattr("torchrl_caiac.influence.truth.true_influence", recorder)
+        scores = [oracle(rows) for oracle in oracles]
+        assert torch.equal(*scores)
+        assert isinstance(asked[0][0], Table) and asked[0][1] == 0
+        assert asked[1] == (Table, 3)
+        # It does not change the truth, so it may change between two calls.
+        assert repr(oracles[0]) == repr(oracles[1])
+
+    def test_killed_and_called_again(self, rows, tmp_path, monkeypatch):
+        rows.memmap(tmp_path / "rows")
+        options = {"key": ("oracle", "score"), "batch_size": 2, "lookahead": 0}
+        monkeypatch.setattr(Interrupted, "asked", [])
+
+        def score(**kwargs):
+            data = TensorDict.load_memmap(tmp_path / "rows")
+            score_buffer(
+                offline_buffer(data),
+                self.oracle(Interrupted, **kwargs),
+                progress=False,
+                **options,
+            )
+            return data["oracle", "score"]
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(Interrupted, "last", 5)
+            score()
+        assert Interrupted.asked == [0, 1, 2, 3, 4]
+        Interrupted.asked.clear()
+        result = score()
+        # What was scored by then is not asked for again, but for the torn chunk.
+        assert Interrupted.asked == [4, 5, 6, 7, 8]
+        assert torch.equal(result, self.oracle()(rows))
+        Interrupted.asked.clear()
+        assert torch.equal(score(num_workers=0), result)
+        assert not Interrupted.asked
+        with pytest.raises(ValueError, match="estimator was"):
+            score(num_actions=7)
+        with pytest.raises(ValueError, match="estimator was"):
+            score(threshold=1e-4)
+
+
+class TestFetchPush:
+    """What ``in_reach`` spares the simulator is not influenced."""
+
+    def test_of_nearly_reached_cubes(self):
+        # The rest of the bound: cubes that are just out of reach do not move, and not
+        # because they are far away.
+        env, states, distances = FetchPushCubes(2), [], []
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            expert = FetchPushExpert(2, action_noise=0.2, rng=rng)
+            observation, _ = env.reset(seed=seed)
+            for _ in range(60):
+                states.append(env.simulator_state())
+                achieved = observation["achieved_goal"].reshape(2, 3)
+                gripper = observation["observation"][:3]
+                distances.append(np.linalg.norm(achieved - gripper, axis=-1))
+                action = expert(observation) if seed % 3 else rng.uniform(-1, 1, 4)
+                observation, *_ = env.step(action)
+        simulator = FetchPushTruth(2)
+        reached = np.stack([simulator.in_reach(state) for state in states])
+        assert reached[:, 0].all()
+        reached = reached[:, 1:]
+        assert 0.1 < reached.mean() < 0.7
+        spared = np.where(reached, np.inf, distances)
+        nearest = np.argsort(spared.min(1))[:80]
+        assert spared[nearest].min() < 0.14
+        truth = true_influence(
+            Everything(), [states[i] for i in nearest], **ASKED
+        ).displacement[:, 1:]
+        assert truth[~torch.from_numpy(reached[nearest])].max() < 1e-4
+        # In reach, many are influenced.
+        nearest = np.argsort(np.min(distances, axis=1))[:20]
+        influenced = true_influence(simulator, [states[i] for i in nearest], **ASKED)
+        assert influenced.influenced[:, 1:].any(1).float().mean() > 0.8
+
+    def test_of_cubes_that_push_cubes(self):
+        env = FetchPushCubes(4)
+        aside = [[x, 0.45] for x in (1.1, 1.2, 1.3, 1.4)]
+        env.reset(seed=0, options={"cubes": aside})
+        for _ in range(3):
+            env.step(np.array([0.0, 0.0, -0.6, 0.0]))
+        x, y, height = env.data.site("robot0:grip").xpos
+        assert height < 0.45
+
+        def moved(*places):
+            state = env.simulator_state()
+            for i, place in enumerate(places):
+                at = env.model.joint(f"object{i}:joint").qposadr[0]
+                state[at : at + 2] = place
+            return state
+
+        # A row before the hand, with gaps of 3 mm; then its last cube alone.
+        row = [[x, y + 0.043 + 0.053 * i] for i in range(4)]
+        states = [moved(*row), moved(*aside[:3], row[3])]
+        truth = true_influence(Everything(4), states, **ASKED).influenced
+        assert truth.tolist() == [[True] * 5, [True, False, False, False, False]]
+        simulator = FetchPushTruth(4)
+        assert [simulator.in_reach(state).tolist() for state in states] == (
+            truth.tolist()
+        )
+
+    def test_a_longer_horizon_reaches_farther(self):
+        env = FetchPushCubes(1)
+        env.reset(seed=0, options={"cubes": [[1.342, 0.85]]})
+        simulator, state = FetchPushTruth(1), env.simulator_state()
+        reached = [simulator.in_reach(state, horizon=h)[1] for h in (1, 4)]
+        assert reached == [False, True]
+        truth = true_influence(Everything(1), [state], horizon=1, **ASKED)
+        assert not truth.influenced[0, 1]
+
+
+class Everything(FetchPushTruth):
+    """Simulates every state."""
+
+    def in_reach(self, state, *, horizon=1):
+        return np.ones(len(self.layout), dtype=np.bool_)
+
+
+ASKED = {"num_actions": 24, "threshold": 1e-3, "progress": False}
 
 
 @pytest.fixture(scope="module")

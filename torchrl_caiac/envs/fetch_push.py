@@ -1027,7 +1027,8 @@ class FetchPushTruth:
 
         A cube is in reach where the gap between it and a link that collides, or a cube
         in reach, is smaller than the way that both can go: an action sets the gripper's
-        target at most 5 cm along each axis, and what moves already goes on.
+        target at most 5 cm off along each axis, which it does not overshoot (it gets
+        7 cm far), and cubes that move go on.
 
         Args:
             state: ``[S]``, of :meth:`FetchPushCubes.simulator_state`.
@@ -1043,8 +1044,8 @@ class FetchPushTruth:
         env._restore(data, state)
         observation = _observation(env._compiled, data, np.empty(env._width))
         cubes = observation[_GRIPPER_WIDTH:].reshape(-1, _CUBE_WIDTH)
-        speed = np.linalg.norm(observation[5:8]) + np.linalg.norm(cubes[:, 6:9], axis=1)
-        way = horizon * (np.sqrt(3) * _ACTION_SCALE + speed.max())
+        speed = np.linalg.norm(cubes[:, 6:9], axis=1).max()
+        way = horizon * (np.sqrt(3) * _ACTION_SCALE + speed)
 
         def near(first: int, second: int) -> bool:
             gap = mujoco.mj_geomDistance(env.model, data, first, second, way, None)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI, causal_action_influence
+from torchrl_caiac.influence.distance import DistanceInfluence
 from torchrl_caiac.influence.score_buffer import MarkUnscored, score_buffer
 from torchrl_caiac.influence.truth import (
+    SimulatorInfluence,
     TrueInfluence,
     best_threshold,
     influence_report,
@@ -15,7 +18,10 @@ from torchrl_caiac.influence.truth import (
 
 __all__ = [
     "CAI",
+    "AttentionInfluence",
+    "DistanceInfluence",
     "MarkUnscored",
+    "SimulatorInfluence",
     "TrueInfluence",
     "best_threshold",
     "causal_action_influence",

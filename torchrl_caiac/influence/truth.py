@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypedDict
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
 from tqdm import tqdm
+
+from torchrl_caiac.experiments import end_with_parent
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -20,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EntityReport",
     "InfluenceSimulator",
+    "SimulatorInfluence",
     "TrueInfluence",
     "best_threshold",
     "draw_actions",
@@ -36,7 +41,13 @@ INFLUENCE_DISTANCE = 2e-3
 
 
 class InfluenceSimulator(Protocol):
-    """What :func:`true_influence` needs of an environment."""
+    """What :func:`true_influence` needs of an environment.
+
+    It may also have ``in_reach(state, *, horizon=1)``, which returns bool ``[N]``:
+    false for an entity that no action can possibly move. A state in which all entities
+    that are not fixed are out of reach is then not simulated; this has to be a safe
+    bound, since nothing else notices influence there.
+    """
 
     @property
     def layout(self) -> EntityLayout:
@@ -59,7 +70,8 @@ class TrueInfluence(NamedTuple):
         influenced: bool ``[S, N]``, in the order of the layout; fixed entities (the
             robot) are always influenced.
         displacement: float32 ``[S, N]``, the largest distance between an entity's next
-            states under any two of the actions (metres and radians alike).
+            states under any two of the actions (metres and radians alike); 0 in states
+            whose simulation was spared by ``in_reach``.
     """
 
     influenced: torch.Tensor
@@ -197,6 +209,7 @@ def true_influence(
         raise ValueError("the simulator's layout must be flat: its states are vectors")
     limits = _limits(layout, threshold)
     columns = [list(layout.columns[name]) for name in layout.names]
+    free = [i for i, name in enumerate(layout.names) if name not in layout.fixed]
     space = simulator.action_space
     actions = draw_actions(space.low, space.high, num_actions, seed=seed)
     displacement = np.empty((len(rows), len(layout)), dtype=np.float32)
@@ -212,7 +225,7 @@ def true_influence(
         if factory is None or num_workers == 0:
             for i, row in enumerate(rows):
                 displacement[i] = _displacement(
-                    simulator, row, actions, columns, horizon
+                    simulator, row, actions, columns, free, horizon
                 )
                 bar.update()
         else:
@@ -223,7 +236,7 @@ def true_influence(
                 num_workers,
                 mp_context=multiprocessing.get_context("spawn"),
                 initializer=_start_worker,
-                initargs=(factory, actions, columns, horizon),
+                initargs=(factory, actions, columns, free, horizon),
             ) as pool:
                 done = pool.map(_work, rows, chunksize=8)
                 for i, values in enumerate(done):
@@ -265,8 +278,12 @@ def _displacement(
     state: Any,
     actions: NDArray[np.float64],
     columns: list[list[int]],
+    free: list[int],
     horizon: int,
 ) -> NDArray[np.float64]:
+    in_reach = getattr(simulator, "in_reach", None)
+    if in_reach is not None and not in_reach(state, horizon=horizon)[free].any():
+        return np.zeros(len(columns))
     after = simulator.outcomes(state, actions, horizon=horizon)
     values = np.empty(len(columns))
     for i, own in enumerate(columns):
@@ -283,10 +300,12 @@ def _start_worker(
     factory: Callable[[], InfluenceSimulator],
     actions: NDArray[np.float64],
     columns: list[list[int]],
+    free: list[int],
     horizon: int,
 ) -> None:
+    end_with_parent()
     torch.set_num_threads(1)
-    _WORKER["arguments"] = (actions, columns, horizon)
+    _WORKER["arguments"] = (actions, columns, free, horizon)
     _WORKER["simulator"] = factory()
 
 
@@ -310,6 +329,91 @@ def oracle_score(influenced: torch.Tensor) -> torch.Tensor:
     if influenced.dtype != torch.bool:
         raise ValueError(f"influenced has dtype {influenced.dtype}, wanted torch.bool")
     return influenced.to(torch.float32)
+
+
+class SimulatorInfluence:
+    """The simulator's truth as an estimator: scores of 1 where influenced, else 0.
+
+    For :func:`~torchrl_caiac.influence.score_buffer.score_buffer`, which then keeps the
+    truth beside the data, takes a killed call up again, and tells truths of different
+    settings apart. Use ``lookahead=0`` to judge other scores by it.
+
+    Args:
+        factory: makes the simulator, see :func:`true_influence`; its class will do.
+
+    Keyword Args:
+        state_key: where each row has what ``outcomes`` takes, ``[*B, S]``.
+        num_actions: actions a state.
+        threshold: distance from which an entity is influenced, one for all or one for
+            each entity that is not fixed.
+        seed: of the actions.
+        num_workers: processes; 0 works in this one.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.envs.kitchen import KitchenEnv
+        >>> oracle = SimulatorInfluence(KitchenEnv, state_key="qpos", num_actions=2)
+        >>> start = torch.tensor(KitchenEnv.default_state())
+        >>> rows = TensorDict({"qpos": start[None]}, [1])
+        >>> oracle(rows).sum()  # the robot only
+        tensor(1.)
+    """
+
+    def __init__(
+        self,
+        factory: Callable[[], InfluenceSimulator],
+        *,
+        state_key: NestedKey = "simulator",
+        num_actions: int = 16,
+        threshold: float | Mapping[str, float] = INFLUENCE_DISTANCE,
+        seed: int = 0,
+        num_workers: int = 0,
+    ) -> None:
+        self.factory = factory
+        self.state_key = unravel_key(state_key)
+        self.num_actions = num_actions
+        self.threshold = threshold
+        self.seed = seed
+        self.num_workers = num_workers
+        self._simulator = factory()
+
+    @property
+    def layout(self) -> EntityLayout:
+        """The simulator's layout."""
+        return self._simulator.layout
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The simulator's state."""
+        return [self.state_key]
+
+    def __call__(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """Asks the simulator.
+
+        Args:
+            tensordict: rows ``[T]`` with ``state_key``.
+
+        Returns:
+            float32 ``[T, N]``, 0 or 1.
+        """
+        truth = true_influence(
+            self.factory if self.num_workers else self._simulator,
+            tensordict[self.state_key],
+            num_actions=self.num_actions,
+            threshold=self.threshold,
+            seed=self.seed,
+            num_workers=self.num_workers,
+            progress=False,
+        )
+        return oracle_score(truth.influenced)
+
+    def __repr__(self) -> str:
+        """The settings that the result depends on."""
+        return (
+            f"{type(self).__name__}({self.factory!r}, state_key={self.state_key!r}, "
+            f"num_actions={self.num_actions}, threshold={self.threshold}, "
+            f"seed={self.seed})"
+        )
 
 
 def _pair(score: Any, truth: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
