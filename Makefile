@@ -10,7 +10,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo bench docs clean
+.PHONY: help setup test lint demo fetch-push bench docs clean
 
 # A stamp without its interpreter (moved folder, removed Python) does not count.
 ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
@@ -18,8 +18,8 @@ ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
 endif
 
 help: ## show this list
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) \
-	    | awk -F ':.*## ' '{ printf "  make %-8s %s\n", $$1, $$2 }'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) \
+	    | awk -F ':.*## ' '{ printf "  make %-10s %s\n", $$1, $$2 }'
 
 setup: $(STAMP) ## create .venv and install everything at its pin (about 6 GB)
 
@@ -54,6 +54,9 @@ lint: setup ## check style, formatting, spelling and types
 
 demo: setup ## the motivating experiment in the kitchen (QUICK=1: a smoke run)
 	$(BIN)/python examples/franka_kitchen/demo.py $(if $(QUICK),quick=true)
+
+fetch-push: setup ## the comparison of arms on Fetch-Push (QUICK=1: a smoke run)
+	$(BIN)/python examples/fetch_push/study.py $(if $(QUICK),quick=true)
 
 bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --benchmark-only \
