@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import sys
+from pathlib import Path
 
 import torchrl_caiac
+
+sys.path.insert(0, str(Path(__file__).parent))  # for gallery_figures
 
 project = "torchrl-caiac"
 author = "torchrl-caiac contributors"
@@ -53,6 +57,8 @@ sphinx_gallery_conf = {
     "examples_dirs": "tutorials",
     "gallery_dirs": "auto_tutorials",
     "filename_pattern": r"plot_",
+    "image_scrapers": ("gallery_figures.save_figures", "matplotlib"),
+    "ignore_repr_types": r"matplotlib\.figure",
     "remove_config_comments": True,
     "show_memory": False,
     "download_all_examples": False,

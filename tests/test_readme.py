@@ -12,11 +12,20 @@ import pytest
 import torch
 from minari.data_collector import EpisodeBuffer
 from tensordict import TensorDictBase
-from torchrl.data import SliceSampler
+from torchrl.data import HERReplayBuffer, SliceSampler, TensorStorage
+from torchrl.objectives import SoftUpdate
 
-from torchrl_caiac import CAIACTransform, EntityLayout
-from torchrl_caiac.data import offline_buffer
-from torchrl_caiac.transforms import WindowGoal
+from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac.data import load_transitions, mix_trajectories, offline_buffer
+from torchrl_caiac.influence import AttentionInfluence, score_buffer
+from torchrl_caiac.modules import (
+    GoalConditionedActor,
+    GoalConditionedCritic,
+    GoalFeatures,
+    TransformerWorldModel,
+)
+from torchrl_caiac.objectives import GoalConditionedTD3Loss
+from torchrl_caiac.transforms import HindsightGoal, WindowGoal
 
 ROOT = Path(__file__).parents[1]
 
@@ -69,27 +78,118 @@ def test_bring_your_own_dataset(
     assert batch["caiac", "counterfactual"].sum() == 256
 
 
-@pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)
-def test_windows(flat_data: TensorDictBase) -> None:
-    layout = EntityLayout(
-        {"robot": range(3), "cup": [3, 4, 5], "jug": [6, 7, 8]},
-        goal={"cup": [0, 1], "jug": [2, 3]},
-        achieved={"cup": [3, 4], "jug": [6, 7]},
-        fixed=["robot"],
-    )
-    data = flat_data[flat_data["episode"] == 1]  # the one that is long enough
-    data["caiac", "score"] = torch.zeros(len(data), 3)
-    text = (ROOT / "docs" / "usage.md").read_text()
-    (code,) = [b for b in python_blocks(text) if "WindowGoal" in b]
+USAGE = python_blocks((ROOT / "docs" / "usage.md").read_text())
+LAYOUT = EntityLayout(
+    {"gripper": range(3), "cup": [3, 4, 5], "jug": [6, 7, 8]},
+    goal={"cup": [0, 1], "jug": [2, 3]},
+    achieved={"cup": [3, 4], "jug": [6, 7]},
+    fixed=["gripper"],
+)
+
+
+def run_usage(start: str, **given: object) -> dict[str, object]:
+    """Runs the code block of docs/usage.md that begins so; what it leaves behind."""
+    (code,) = [block for block in USAGE if block.startswith(start)]
     scope = {
+        "AttentionInfluence": AttentionInfluence,
         "CAIACTransform": CAIACTransform,
+        "CoDATransform": CoDATransform,
+        "GoalConditionedActor": GoalConditionedActor,
+        "GoalConditionedCritic": GoalConditionedCritic,
+        "GoalConditionedTD3Loss": GoalConditionedTD3Loss,
+        "GoalFeatures": GoalFeatures,
+        "HERReplayBuffer": HERReplayBuffer,
+        "HindsightGoal": HindsightGoal,
         "SliceSampler": SliceSampler,
+        "SoftUpdate": SoftUpdate,
+        "TensorStorage": TensorStorage,
         "WindowGoal": WindowGoal,
-        "data": data,
-        "layout": layout,
+        "layout": LAYOUT,
+        "load_transitions": load_transitions,
+        "mix_trajectories": mix_trajectories,
         "offline_buffer": offline_buffer,
+        "reward": lambda achieved, desired: -(achieved != desired).any(-1).float(),
+        "score_buffer": score_buffer,
+        **given,
     }
     exec(compile(code, "usage.md", "exec"), scope)
-    windows = scope["windows"]
+    return scope
+
+
+@pytest.fixture
+def scored(flat_data: TensorDictBase) -> TensorDictBase:
+    """The shared trajectories, nothing in them influenced."""
+    flat_data["caiac", "score"] = torch.zeros(len(flat_data), 3)
+    return flat_data
+
+
+in_memory = pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)
+
+
+@in_memory
+def test_windows(scored: TensorDictBase) -> None:
+    long_enough = scored[scored["episode"] == 1]
+    windows = run_usage("goals = WindowGoal", data=long_enough)["windows"]
     assert windows.batch_size == (128, 10)
     assert windows["caiac", "swapped"].any()
+
+
+@in_memory
+def test_hindsight_goals_and_td3(scored: TensorDictBase) -> None:
+    scope = run_usage("goals = HindsightGoal(layout, reward)\n", data=scored)
+    batch = scope["batch"]
+    counterfactual = batch["caiac", "counterfactual"].squeeze(-1)
+    assert counterfactual.sum() == 256
+    relabeled = batch["hindsight", "relabeled"].squeeze(-1)
+    assert relabeled[counterfactual].any()
+    assert relabeled[~counterfactual].any()
+
+    scope = run_usage("features = ", rb=scope["rb"], action_dim=2)
+    loss = scope["loss"](batch)
+    assert loss["loss_actor"].isfinite()
+    assert loss["loss_qvalue"].isfinite()
+    loss = run_usage(
+        "loss = GoalConditionedTD3Loss", actor=scope["actor"], critics=scope["critics"]
+    )["loss"]
+    loss.make_value_estimator(gamma=0.97)
+    SoftUpdate(loss, tau=0.005)
+    assert loss(batch)["bc_loss"].isfinite()
+
+
+@in_memory
+def test_replay_buffer_that_relabels_itself(scored: TensorDictBase) -> None:
+    rb = run_usage("goals = HindsightGoal(layout, reward, future=0.0)", data=scored)[
+        "rb"
+    ]
+    batch = rb.sample()
+    assert batch["hindsight", "relabeled"][:128].all()
+    assert not batch["hindsight", "relabeled"][128:256].any()
+    assert batch["hindsight", "relabeled"][256:].any()
+
+
+@in_memory
+def test_mixture(
+    scored: TensorDictBase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("expert", "random"):
+        # Ten times the same four trajectories.
+        rows = torch.cat([scored] * 10)
+        rows["episode"] = rows["episode"] + 4 * torch.arange(10).repeat_interleave(
+            len(scored)
+        )
+        rows.memmap(f"data/{name}")
+    tenth = run_usage("expert, random = ")["tenth"]
+    # 40 random trajectories are 70 % of 57.
+    assert len(tenth["episode"].unique()) == 6
+    assert (tenth["source"] == 0).any()
+    assert (tenth["source"] == 1).any()
+
+
+@in_memory
+def test_coda(scored: TensorDictBase) -> None:
+    rb = offline_buffer(scored, batch_size=8)
+    model = TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8)
+    run_usage("attention = ", rb=rb, transformer=model)
+    assert rb.sample()["coda", "graph"].shape == (8, 4, 3)
+    assert rb.sample()["caiac", "swapped"].shape == (8, 3)

@@ -18,8 +18,8 @@ from torchrl_caiac.influence import CAI, roc_auc, score_buffer
 from torchrl_caiac.modules import GaussianWorldModel
 from torchrl_caiac.objectives import fit_world_model
 
-torch.set_num_threads(1)
 torch.manual_seed(0)
+torch.set_num_threads(1)
 
 # %%
 # A table with two pucks
