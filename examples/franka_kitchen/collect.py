@@ -1,27 +1,49 @@
 """Collects the demonstrations and the random actions, as Minari datasets (A.6.1, A.7).
 
 ``python collect.py``; a collection that was killed goes on where it stopped.
+``experiment=all_tasks`` collects chains of tasks instead of single ones.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import hydra
+from minari import MinariDataset
 from omegaconf import DictConfig
-from settings import keep_settings
 
 from torchrl_caiac.data import (
     create_kitchen_demonstrations,
+    create_kitchen_play,
     create_kitchen_random,
     kitchen_transitions,
 )
 from torchrl_caiac.data.kitchen_datasets import (
     DEMONSTRATIONS_ID,
     MICROWAVE_KETTLE,
+    PLAY_ID,
     RANDOM_ID,
 )
+from torchrl_caiac.experiments import keep_settings
+
+
+def create(cfg: DictConfig, dataset_id: str, episodes: int, seed: int) -> MinariDataset:
+    """Collects as many demonstrations a task, or a chain of tasks."""
+    options: dict[str, Any] = {
+        "root": Path(cfg.out) / "minari",
+        "work": Path(cfg.out) / "work",
+        "seed": seed,
+        "workers": cfg.collect.workers,
+        "overwrite": True,
+    }
+    if cfg.collect.chains:
+        return create_kitchen_play(dataset_id, episodes=episodes, **options)[0]
+    groups = [dataclasses.replace(g, episodes=episodes) for g in MICROWAVE_KETTLE]
+    return create_kitchen_demonstrations(dataset_id, demonstrations=groups, **options)[
+        0
+    ]
 
 
 def collect(cfg: DictConfig) -> None:
@@ -30,36 +52,24 @@ def collect(cfg: DictConfig) -> None:
     ``demonstrations`` and ``random`` are learnt from; ``held_out`` are demonstrations
     with other seeds, which only check the scores.
     """
-    keep_settings(cfg, "collect")
     settings = cfg.collect
     out = Path(cfg.out)
-    root, work = out / "minari", out / "work"
+    keep_settings(settings, out / "collect.json")
+    demonstrations = PLAY_ID if settings.chains else DEMONSTRATIONS_ID
     for name, dataset_id, episodes, seed in (
-        ("demonstrations", DEMONSTRATIONS_ID, settings.episodes, settings.seed),
+        ("demonstrations", demonstrations, settings.episodes, settings.seed),
         ("held_out", "kitchen/held-out-v0", settings.held_out, settings.seed + 1),
     ):
-        if (out / name).exists():
-            continue
-        dataset, _ = create_kitchen_demonstrations(
-            dataset_id,
-            demonstrations=[
-                dataclasses.replace(group, episodes=episodes)
-                for group in MICROWAVE_KETTLE
-            ],
-            root=root,
-            work=work,
-            seed=seed,
-            workers=settings.workers,
-            overwrite=True,
-        )
-        kitchen_transitions(dataset, out / name)
+        if not (out / name).exists():
+            dataset = create(cfg, dataset_id, episodes, seed)
+            kitchen_transitions(dataset, out / name)
     if not (out / "random").exists():
         dataset = create_kitchen_random(
-            DEMONSTRATIONS_ID,
+            demonstrations,
             RANDOM_ID,
             ratio=settings.random_ratio,
-            root=root,
-            work=work,
+            root=out / "minari",
+            work=out / "work",
             seed=settings.seed,
             workers=settings.workers,
             overwrite=True,

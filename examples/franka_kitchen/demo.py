@@ -1,19 +1,17 @@
-"""The paper's first result, from an empty folder (section 4.1, Fig. 3).
+"""The paper's kitchens, from an empty folder (sections 4.1 and A.2.1, Fig. 3 and 6).
 
-``make demo`` runs this: collect, fit, score, train the arms side by side, evaluate, and
-report. ``python demo.py quick=true`` is a smoke run of the same steps. What is finished
-in the output folder is not done again.
+``make demo`` runs the motivating experiment: collect, fit, score, train the arms side
+by side, evaluate, and report. ``python demo.py experiment=all_tasks`` does so with
+chains of tasks and all tasks asked for; with ``quick=true`` either is a smoke run. What
+is finished in the output folder is not done again.
 """
 
 from __future__ import annotations
 
-import json
 import logging
-import multiprocessing
-import os
+import math
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
@@ -31,6 +29,7 @@ from train import Arm, make_buffer, train
 from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv, RenderingUnavailable
+from torchrl_caiac.experiments import run_side_by_side, write_json
 from torchrl_caiac.plotting import (
     bootstrap_interval,
     plot_frames,
@@ -43,11 +42,9 @@ _SWAP_BATCHES = 50  # batches from which the share of swapped windows is taken
 
 
 def run_arm(
-    cfg: DictConfig, arm: Arm, seed: int, position: int
+    cfg: DictConfig, arm: Arm, seed: int
 ) -> tuple[list[dict[str, Any]], float, float]:
     """Trains and evaluates one arm with one seed; with the seconds that each took."""
-    torch.set_num_threads(1)
-    os.environ["TQDM_POSITION"] = str(position)
     start = time.perf_counter()
     train(cfg, arm, seed)
     trained = time.perf_counter()
@@ -67,14 +64,16 @@ def draw_influence(cfg: DictConfig, path: Path) -> None:
     """Fig. 6: the influence on every entity along a held-out demonstration."""
     data = load_transitions(Path(cfg.out) / "held_out")
     truth = torch.load(Path(cfg.out) / "held_out_truth.pt", weights_only=True)
-    rows = data["episode"] == data["episode"][data["task"] == 0][0]
+    rows = data["episode"] == cfg.demo.influence_episode
+    tasks = data["task"][rows].unique_consecutive()
+    names = dict.fromkeys(KITCHEN_TASKS[task] for task in tasks if task >= 0)
     plot_influence(
         data["caiac", "score"][rows].numpy(),
         KitchenEnv.layout.names,
         truth=truth[rows].numpy(),
         threshold=cfg.score.threshold,
         exclude=["robot"],
-        title="influence along a demonstration of the microwave",
+        title="influence along a demonstration:\n" + ", ".join(names).replace("_", " "),
     ).savefig(path, dpi=150)
 
 
@@ -89,15 +88,17 @@ def draw_counterfactuals(cfg: DictConfig, path: Path) -> None:
         counterfactual_ratio=copies / 512,
     )
     states, titles = [], []
-    for task in ("microwave", "kettle"):
-        own = data["episode"][data["task"] == KITCHEN_TASKS.index(task)]
-        demonstration = (data["episode"] == own[0]).nonzero()
+    for task in cfg.demo.frames:
+        own = data["task"] == KITCHEN_TASKS.index(task)
+        first = data["episode"][own][0]
+        demonstration = (own & (data["episode"] == first)).nonzero()
         row = demonstration[int(0.75 * len(demonstration))]
         donors = torch.randint(len(data), (512 - copies,))
         batch = transform(data[torch.cat([donors, row.expand(copies)])])
         made, shown = batch["observation"][-copies:], data["observation"][row]
         states += [shown[0], made[torch.cdist(made, shown).argmax()]]
-        titles += [f"{task}, demonstration", f"{task}, counterfactual"]
+        name = task.replace("_", " ")
+        titles += [f"{name}, demonstration", f"{name}, counterfactual"]
     kitchen = KitchenEnv(render_mode="rgb_array")
     try:
         frames = kitchen.render_states(torch.stack(states).numpy())
@@ -115,21 +116,29 @@ def report_table(
 ) -> str:
     """The table that the demo prints."""
     lines = ["", "influence on unseen demonstrations"]
-    lines.append(f"  {'entity':<22}{'AUC':>7}{'influenced':>12}{'score <= theta':>16}")
+    lines.append(
+        f"  {'entity':<22}{'AUC':>7}{'influenced':>12}{'score <= theta':>16}"
+        f"{'false -':>10}{'false +':>10}"
+    )
     for name, row in influence.items():
         if name in KitchenEnv.layout.fixed:
             continue
-        auc = "-" if row["auc"] != row["auc"] else f"{row['auc']:.3f}"
+        auc, missed = (
+            # There is neither where nothing influences the entity.
+            ("-", "-")
+            if math.isnan(row["auc"])
+            else (f"{row['auc']:.3f}", f"{1 - row['hit_rate']:.1%}")
+        )
         lines.append(
             f"  {name:<22}{auc:>7}{row['influenced']:>12.1%}"
-            f"{row['below_threshold']:>16.1%}"
+            f"{row['below_threshold']:>16.1%}{missed:>10}{row['false_alarms']:>10.1%}"
         )
     lines += [
         "",
         f"windows with a swap: {share:.1%} (counterfactual are "
         f"{cfg.train.counterfactual_ratio:.0%})",
         "",
-        "success over all objects, 95 % interval over episodes",
+        "success over all objects, 95 % interval over episodes; over the task's own",
     ]
     for arm, task in product(cfg.demo.arms, cfg.evaluate.tasks):
         mine = [r for r in results if r["arm"] == arm and r["task"] == task]
@@ -141,8 +150,10 @@ def report_table(
             if (count := sum(name in r["wrong_tasks"] for r in mine))
         }
         lines.append(
-            f"  {arm:<8}{task:<12}{sum(solved) / len(solved):>6.2f} "
-            f"[{low:.2f}, {high:.2f}] of {len(mine)}   wrong tasks done: "
+            f"  {arm:<8}{task:<15}{sum(solved) / len(solved):>6.2f} "
+            f"[{low:.2f}, {high:.2f}] of {len(mine)}; "
+            f"{sum(r['task_success'] for r in mine) / len(mine):.2f}   "
+            "wrong tasks done: "
             + (", ".join(f"{name} {count}" for name, count in wrong.items()) or "none")
         )
     lines += ["", "seconds a stage"]
@@ -172,27 +183,20 @@ def main(cfg: DictConfig) -> None:
         fit(cfg)
     with stage("score, and ask the simulator"):
         influence = score(cfg)
-    with (
-        stage("train and evaluate"),
-        ProcessPoolExecutor(
-            cfg.demo.processes, mp_context=multiprocessing.get_context("spawn")
-        ) as pool,
-    ):
+    with stage("train and evaluate"):
         # Started in pairs of arms, so that each process has both kinds of work.
-        runs = [
-            pool.submit(run_arm, cfg, arm, seed, position)
-            for seed, (position, arm) in product(
-                cfg.demo.seeds, enumerate(cfg.demo.arms)
-            )
+        jobs = [
+            (cfg, arm, seed) for seed, arm in product(cfg.demo.seeds, cfg.demo.arms)
         ]
-        finished = [run.result() for run in runs]
+        by_job = dict(run_side_by_side(run_arm, jobs, processes=cfg.demo.processes))
+        finished = [by_job[i] for i in range(len(jobs))]
     seconds["  of it training, a run"] = sum(f[1] for f in finished) / len(finished)
     seconds["  of it evaluation, a run"] = sum(f[2] for f in finished) / len(finished)
     results = [result for run in finished for result in run[0]]
     left_out = ""
     with stage("figures"):
         figures.mkdir(exist_ok=True)
-        draw_influence(cfg, figures / "demo_influence.png")
+        draw_influence(cfg, figures / f"{cfg.name}_influence.png")
         plot_success(
             {
                 arm: {
@@ -205,16 +209,17 @@ def main(cfg: DictConfig) -> None:
                 }
                 for arm in cfg.demo.arms
             },
-            title="success over all objects, the cabinet is closed",
-        ).savefig(figures / "demo_success.png", dpi=150)
+            title=cfg.title,
+        ).savefig(figures / f"{cfg.name}_success.png", dpi=150)
         try:
-            draw_counterfactuals(cfg, figures / "demo_counterfactuals.png")
+            draw_counterfactuals(cfg, figures / f"{cfg.name}_counterfactuals.png")
         except RenderingUnavailable as error:
             left_out = f"left out: the counterfactual frames ({error})"
     table = report_table(cfg, influence, share_swapped(cfg), results, seconds)
-    (Path(cfg.out) / "demo.txt").write_text(table)
-    (Path(cfg.out) / "demo.json").write_text(
-        json.dumps({"results": results, "seconds": seconds}, indent=1) + "\n"
+    (Path(cfg.out) / f"{cfg.name}.txt").write_text(table)
+    write_json(
+        Path(cfg.out) / f"{cfg.name}.json",
+        {"influence": influence, "results": results, "seconds": seconds},
     )
     print(table)
     print(f"figures: {figures}")

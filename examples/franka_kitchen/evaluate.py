@@ -1,4 +1,4 @@
-"""Asks a trained agent for each task, from the default start (the cabinet is closed).
+"""Asks a trained agent for each task, from the default start or from random ones.
 
 Run after ``train.py``: ``python evaluate.py arm=caiac seed=0``. Success means that
 *all* objects are where the goal wants them (paper, A.6.1).
@@ -15,12 +15,13 @@ from typing import Any
 
 import hydra
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import SerialEnv, TransformedEnv
 from tqdm.auto import tqdm
 from train import Arm, run_folder, train
 
 from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv, make_kitchen_env
+from torchrl_caiac.experiments import bar_position, write_json
 from torchrl_caiac.modules import LMPActor, LMPModel
 from torchrl_caiac.plotting import plot_frames
 
@@ -28,12 +29,19 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def evaluate_task(
-    model: LMPModel, task: str, *, episodes: int, seed: int, strips: int, folder: Path
+    model: LMPModel,
+    task: str,
+    *,
+    start: str,
+    episodes: int,
+    seed: int,
+    strips: int,
+    folder: Path,
 ) -> list[dict[str, Any]]:
     """Plays episodes of one task side by side; one result an episode."""
     torch.manual_seed(seed)
     actor = LMPActor(model)
-    base = SerialEnv(episodes, partial(make_kitchen_env, task))
+    base = SerialEnv(episodes, partial(make_kitchen_env, task, start=start))
     env = TransformedEnv(base, actor.make_tensordict_primer())
     env.set_seed(seed)
     try:
@@ -81,14 +89,30 @@ def evaluate_task(
 
 
 def evaluate(cfg: DictConfig, arm: Arm, seed: int) -> list[dict[str, Any]]:
-    """Evaluates one trained arm on all tasks; writes ``evaluation.json`` beside it."""
+    """Evaluates one trained arm on all tasks; writes ``evaluation.json`` beside it.
+
+    What is there with the same settings is not done again.
+    """
     model = train(cfg, arm, seed)
     folder = run_folder(cfg, arm, seed)
+    path = folder / "evaluation.json"
+    settings = OmegaConf.to_container(cfg.evaluate)
+    if path.exists():
+        kept = json.loads(path.read_text())
+        if kept["settings"] == settings:
+            return kept["results"]
     results: list[dict[str, Any]] = []
-    for task in tqdm(cfg.evaluate.tasks, desc=f"{folder.name} plays", unit="task"):
+    bar = tqdm(
+        cfg.evaluate.tasks,
+        desc=f"{folder.name} plays",
+        unit="task",
+        position=bar_position(),
+    )
+    for task in bar:
         results += evaluate_task(
             model,
             task,
+            start=cfg.evaluate.start,
             episodes=cfg.evaluate.episodes,
             seed=cfg.evaluate.seed + seed,
             strips=cfg.evaluate.strips,
@@ -96,14 +120,18 @@ def evaluate(cfg: DictConfig, arm: Arm, seed: int) -> list[dict[str, Any]]:
         )
     for result in results:
         result |= {"arm": arm, "seed": seed}
-    path = folder / "evaluation.json"
-    partial_path = path.with_suffix(".partial")
-    partial_path.write_text(json.dumps(results, indent=1) + "\n")
-    partial_path.replace(path)
+    write_json(path, {"settings": settings, "results": results})
     for task in cfg.evaluate.tasks:
         mine = [result for result in results if result["task"] == task]
-        share = sum(result["success"] for result in mine) / len(mine)
-        _LOGGER.info("%s: %s solved in %.0f %%", folder.name, task, 100 * share)
+        _LOGGER.info(
+            "%s: %s solved in %.0f %%, its own object right in %.0f %%",
+            folder.name,
+            task,
+            *(
+                100 * sum(result[key] for result in mine) / len(mine)
+                for key in ("success", "task_success")
+            ),
+        )
     return results
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig
-from settings import keep_settings
 
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
+from torchrl_caiac.experiments import keep_settings
 from torchrl_caiac.modules import GaussianWorldModel
 from torchrl_caiac.objectives import fit_world_model
 
@@ -24,10 +24,10 @@ _LOGGER = logging.getLogger(__name__)
 
 def fit(cfg: DictConfig) -> GaussianWorldModel:
     """Fits the world model, or loads it where that has been done."""
-    keep_settings(cfg, "world_model")
     settings = cfg.world_model
-    torch.manual_seed(settings.seed)
     out = Path(cfg.out)
+    keep_settings(settings, out / "world_model.json")
+    torch.manual_seed(settings.seed)
     model = GaussianWorldModel(
         KitchenEnv.layout,
         9,

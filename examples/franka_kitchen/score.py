@@ -7,7 +7,6 @@ simulator for their truth, ``("oracle", "score")``.
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,12 @@ import hydra
 import torch
 from fit_world_model import fit
 from omegaconf import DictConfig
-from settings import keep_settings
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.envs import KitchenEnv
+from torchrl_caiac.experiments import keep_settings, whole_file, write_json
 from torchrl_caiac.influence import (
     CAI,
     influence_report,
@@ -33,19 +32,33 @@ from torchrl_caiac.influence import (
 _LOGGER = logging.getLogger(__name__)
 
 
-def simulator_truth(data: TensorDictBase, path: Path, cfg: DictConfig) -> torch.Tensor:
-    """Which entities the action can move in each row, bool ``[T, N]``; kept on disk."""
+def simulator_truth(
+    data: TensorDictBase, path: Path, cfg: DictConfig, actions: int, every: int = 1
+) -> torch.Tensor:
+    """Which entities the action can move in each row, bool ``[T, N]``; kept on disk.
+
+    Only every ``every``-th row of a trajectory is asked about. A row in between counts
+    as influenced where one of the two rows around it is.
+    """
     if not path.exists():
+        counts = data["episode"].unique_consecutive(return_counts=True)[1]
+        position = torch.cat([torch.arange(count) for count in counts])
+        asked = position % every == 0
         states = torch.cat([data["sim", "qpos"], data["sim", "qvel"]], -1)
         truth = true_influence(
             KitchenEnv,
-            states,
-            num_actions=cfg.score.truth_actions,
-            num_workers=cfg.collect.workers,
+            states[asked],
+            num_actions=actions,
+            # One worker is this process.
+            num_workers=cfg.collect.workers if cfg.collect.workers > 1 else 0,
         )
-        partial = path.with_suffix(".partial")
-        torch.save(truth.influenced, partial)
-        partial.replace(path)
+        known = torch.zeros(len(data), len(KitchenEnv.layout), dtype=torch.bool)
+        known[asked] = truth.influenced
+        before = torch.arange(len(data)) - position % every
+        after = (before + every).clamp(max=len(data) - 1)
+        alone = asked | (data["episode"][after] != data["episode"])
+        with whole_file(path) as partial:
+            torch.save(known[before] | known[before.where(alone, after)], partial)
     influenced = torch.load(path, weights_only=True)
     if influenced.shape != (len(data), len(KitchenEnv.layout)):
         raise ValueError(
@@ -85,9 +98,9 @@ def store_oracle(
 
 def score(cfg: DictConfig) -> dict[str, Any]:
     """Scores the demonstrations and reports how good scores are on held-out ones."""
-    keep_settings(cfg, "score")
     settings = cfg.score
     out = Path(cfg.out)
+    keep_settings(settings, out / "score.json")
     estimator = CAI(fit(cfg), num_actions=settings.num_actions)
     options = {"batch_size": settings.batch_size, "smoothing": settings.smoothing}
     demonstrations = load_transitions(out / "demonstrations")
@@ -98,7 +111,13 @@ def score(cfg: DictConfig) -> dict[str, Any]:
         **options,
     )
     if "oracle" in (cfg.arm, *cfg.demo.arms):
-        influenced = simulator_truth(demonstrations, out / "truth.pt", cfg)
+        influenced = simulator_truth(
+            demonstrations,
+            out / "truth.pt",
+            cfg,
+            settings.oracle_actions,
+            settings.oracle_every,
+        )
         store_oracle(demonstrations, influenced, settings.lookahead)
     held_out = load_transitions(out / "held_out")
     # The truth is about a row's own state, so the next one is left out here.
@@ -109,14 +128,15 @@ def score(cfg: DictConfig) -> dict[str, Any]:
     report: dict[str, Any] = dict(
         influence_report(
             scores,
-            simulator_truth(held_out, out / "held_out_truth.pt", cfg),
+            simulator_truth(
+                held_out, out / "held_out_truth.pt", cfg, settings.truth_actions
+            ),
             KitchenEnv.layout.names,
             threshold=settings.threshold,
         )
     )
-    path = out / "influence.json"
-    path.write_text(json.dumps(report, indent=1) + "\n")
-    for name in ("microwave", "kettle"):
+    write_json(out / "influence.json", report)
+    for name in cfg.evaluate.tasks:
         _LOGGER.info("%s: %s", name, report[name])
     return report
 

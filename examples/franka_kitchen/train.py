@@ -7,20 +7,13 @@ on at its last checkpoint and ends as one that was not.
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 from typing import Literal
 
 import hydra
 import torch
 from omegaconf import DictConfig
-from settings import keep_settings
 from tensordict import TensorDictBase
-from torchrl.checkpoint import (
-    Checkpoint,
-    GlobalRNGState,
-    StateDictCheckpointAdapter,
-)
 from torchrl.data import (
     ImmutableDatasetWriter,
     SliceSampler,
@@ -33,6 +26,11 @@ from tqdm.auto import tqdm
 from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
+from torchrl_caiac.experiments import (
+    TrainingCheckpoint,
+    bar_position,
+    keep_settings,
+)
 from torchrl_caiac.modules import LMPModel
 from torchrl_caiac.objectives import LMPLoss
 from torchrl_caiac.transforms import WindowGoal
@@ -90,6 +88,8 @@ def make_model(cfg: DictConfig) -> LMPModel:
         plan_dim=cfg.train.plan_dim,
         hidden_size=cfg.train.hidden_size,
         decoder=cfg.train.decoder,
+        observation_floor=cfg.train.observation_floor,
+        goal_floor=cfg.train.observation_floor,
     )
 
 
@@ -102,11 +102,19 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
     """Trains one arm with one seed, or loads it where that has been done."""
     settings = cfg.train
     folder = run_folder(cfg, arm, seed)
-    keep_settings(cfg, "train", folder)
+    keep_settings(settings, folder / "train.json")
     torch.manual_seed(seed)
     data = load_transitions(Path(cfg.out) / "demonstrations")
     model = make_model(cfg)
-    model.fit_statistics(data, goals=KitchenEnv.layout.achieved_goal(data, next=True))
+    goals = KitchenEnv.layout.achieved_goal(data, next=True)
+    model.fit_statistics(data, goals=goals)
+    # What rests in all demonstrations is left out: its weights would stay as they were
+    # drawn, and other values of it at test time disturb everything.
+    for norm, values in (
+        (model.observation_norm, data["observation"]),
+        (model.goal_norm, goals),
+    ):
+        norm.std[values.std(0) < settings.resting] = torch.inf
     loss_module = LMPLoss(
         model,
         kl_weight=settings.kl_weight,
@@ -115,27 +123,14 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
     optimizer = torch.optim.Adam(model.parameters(), lr=settings.lr, fused=True)
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
     rb = make_buffer(data, cfg, arm)
-    checkpoint = Checkpoint(format="archive")
-    for name, part in {
-        "model": model,
-        "optimizer": optimizer,
-        "scheduler": scheduler,
-        "rng": GlobalRNGState(),
-    }.items():
-        # As tensordicts the optimizer would get views of the file, and write into it.
-        adapter = StateDictCheckpointAdapter(payload_format="torch")
-        checkpoint.register(name, part, adapter=adapter)
-    path = folder / "checkpoint.zip"
-    step = 0
-    if path.exists():
-        try:
-            checkpoint.load(path)
-        except Exception as error:
-            raise ValueError(
-                f"{path} is no readable checkpoint of this training, it may be "
-                f"truncated or foreign ({error}): delete it to begin anew"
-            ) from error
-        step = scheduler.last_epoch
+    checkpoint = TrainingCheckpoint(
+        folder / "checkpoint.zip",
+        model=model,
+        optimizer=optimizer,
+        scheduler=scheduler,
+    )
+    step = checkpoint.load()
+    if step:
         _LOGGER.info("%s goes on at step %d", folder.name, step)
     logger = get_logger(settings.logger, str(folder), "log")
     bar = tqdm(
@@ -144,7 +139,7 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
         desc=folder.name,
         unit="step",
         mininterval=5,
-        position=int(os.environ.get("TQDM_POSITION", "0")),
+        position=bar_position(),
     )
     swapped = torch.zeros(())
     model.train()
@@ -173,7 +168,7 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
                     logger.log_scalar(key, value, step=step)
                 bar.set_postfix(loss=f"{loss.item():.3f}")
             if step % settings.checkpoint_every == 0 or step == settings.steps:
-                checkpoint.save(path)
+                checkpoint.save(step)
     finally:
         torch.set_flush_denormal(False)
     bar.close()

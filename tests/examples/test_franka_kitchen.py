@@ -1,22 +1,26 @@
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import hydra
 import pytest
 import torch
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 
-from torchrl_caiac.data import load_transitions
+from torchrl_caiac.data import create_kitchen_play, load_transitions
 from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv
 
 FOLDER = Path(__file__).parents[2] / "examples" / "franka_kitchen"
 SMALL = {
     "collect": {"episodes": 2, "held_out": 1, "workers": 1},
     "world_model": {"steps": 60, "eval_every": 30, "hidden_sizes": [32]},
-    "score": {"truth_actions": 2, "num_actions": 8},
+    "score": {"truth_actions": 2, "oracle_actions": 2, "num_actions": 8},
     "train": {
         "steps": 12,
         "windows": 16,
@@ -31,7 +35,7 @@ SMALL = {
 @pytest.fixture(scope="module")
 def steps():
     """The scripts of the example, as modules."""
-    names = ("settings", "collect", "fit_world_model", "score", "train", "evaluate")
+    names = ("collect", "fit_world_model", "score", "train", "evaluate", "demo")
     before = set(sys.modules)
     sys.path.insert(0, str(FOLDER))
     yield {name: importlib.import_module(name) for name in names}
@@ -153,7 +157,99 @@ def test_evaluation(cfg, steps):
     results = steps["evaluate"].evaluate(cfg, "none", seed=0)
     assert [result["episode"] for result in results] == [0, 1]
     written = steps["train"].run_folder(cfg, "none", 0) / "evaluation.json"
-    assert json.loads(written.read_text()) == results
+    kept = json.loads(written.read_text())
+    assert kept["results"] == results
+    # It is not played again, unless something else is asked for.
+    kept["results"] = ["kept"]
+    written.write_text(json.dumps(kept))
+    assert steps["evaluate"].evaluate(cfg, "none", seed=0) == ["kept"]
+    other = cfg.copy()
+    other.evaluate.episodes = 1
+    assert len(steps["evaluate"].evaluate(other, "none", seed=0)) == 1
     for result in results:
         assert result["success"] or result["steps"] == 280
         assert "kettle" not in result["wrong_tasks"]
+
+
+def test_truth_between_the_rows_that_were_asked_about(tmp_path, steps, monkeypatch):
+    """Against every row looked at on its own, trajectories of all lengths around 4."""
+    generator = torch.Generator().manual_seed(0)
+    lengths = torch.tensor([9, 1, 4, 5, 2, 8])
+    episode = torch.arange(6).repeat_interleave(lengths)
+    state = torch.arange(len(episode), dtype=torch.float64)
+    data = TensorDict(
+        {
+            "episode": episode,
+            "sim": {"qpos": state.unsqueeze(-1), "qvel": state.unsqueeze(-1)},
+        },
+        [len(episode)],
+    )
+    entities = len(KitchenEnv.layout)
+    whole = torch.rand(len(data), entities, generator=generator) < 0.3
+    asked = []
+
+    def simulator(env, states, **_):
+        asked.append(states[:, 0].long())
+        return SimpleNamespace(influenced=whole[asked[-1]])
+
+    monkeypatch.setattr(steps["score"], "true_influence", simulator)
+    cfg = OmegaConf.create({"collect": {"workers": 1}})
+    first = 0
+    wanted, rows = [], []
+    for length in lengths.tolist():
+        for step in range(length):
+            left = step - step % 4
+            around = {left, left + 4 if step % 4 and left + 4 < length else left}
+            wanted.append(whole[[first + place for place in around]].any(0))
+        rows += range(first, first + length, 4)
+        first += length
+    truth = steps["score"].simulator_truth(data, tmp_path / "four.pt", cfg, 2, 4)
+    assert asked[0].tolist() == rows
+    assert torch.equal(truth, torch.stack(wanted))
+    truth = steps["score"].simulator_truth(data, tmp_path / "one.pt", cfg, 2)
+    assert torch.equal(truth, whole)
+
+
+def test_all_tasks(tmp_path, steps, monkeypatch):
+    """Chains instead of single tasks, through all the steps."""
+    with hydra.initialize_config_dir(str(FOLDER), version_base=None):
+        cfg = hydra.compose("config", ["experiment=all_tasks"])
+    assert cfg.train.window == 10
+    assert set(cfg.evaluate.tasks) == set(KITCHEN_TASKS)
+    cfg = OmegaConf.merge(cfg, SMALL)
+    cfg.out = str(tmp_path)
+    cfg.collect.episodes = 1
+    cfg.demo.influence_episode = 0
+    play = functools.partial(create_kitchen_play, orders=[("kettle", "slide cabinet")])
+    monkeypatch.setattr(steps["collect"], "create_kitchen_play", play)
+    steps["collect"].collect(cfg)
+    data = load_transitions(tmp_path / "demonstrations")
+    order = [KITCHEN_TASKS.index(task) for task in ("kettle", "slide_cabinet")]
+    assert data["task"].unique_consecutive().tolist() == order
+    report = steps["score"].score(cfg)
+    for task in ("kettle", "slide_cabinet"):
+        assert 0 < report[task]["influenced"] < 1
+    scored = load_transitions(tmp_path / "demonstrations")
+    batch = steps["train"].make_buffer(scored, cfg, "oracle").sample()
+    # 13 of 16 windows, the ratio being 0.8.
+    assert batch["caiac", "counterfactual"].sum() == 130
+    starts = []
+    reset = KitchenEnv.reset
+
+    def kept(self, **kwargs):
+        result = reset(self, **kwargs)
+        starts.append(self.qpos)
+        return result
+
+    monkeypatch.setattr(KitchenEnv, "reset", kept)
+    cfg.evaluate.episodes = 1
+    results = steps["evaluate"].evaluate(cfg, "caiac", seed=0)
+    moved = abs(starts[-1] - KitchenEnv.default_state()) > 1e-3
+    columns = KitchenEnv.layout.columns
+    assert moved[9:].any()
+    assert not moved[list(columns["kettle"])].any()
+    cfg.demo.arms = ["caiac"]
+    table = steps["demo"].report_table(cfg, report, 0.5, results, {"collect": 1.0})
+    assert "caiac   kettle" in table
+    steps["demo"].draw_influence(cfg, tmp_path / "influence.png")
+    assert (tmp_path / "influence.png").stat().st_size > 10_000
