@@ -22,6 +22,7 @@ import torch
 from collect import collect
 from evaluate import evaluate
 from fit_world_model import fit
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from score import score
 from train import Arm, make_buffer, train
@@ -29,7 +30,7 @@ from train import Arm, make_buffer, train
 from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv, RenderingUnavailable
-from torchrl_caiac.experiments import run_side_by_side, write_json
+from torchrl_caiac.experiments import claim_folder, run_side_by_side, write_json
 from torchrl_caiac.plotting import (
     bootstrap_interval,
     plot_frames,
@@ -161,12 +162,8 @@ def report_table(
     return "\n".join(lines) + "\n"
 
 
-@hydra.main(version_base=None, config_path=".", config_name="config")
-def main(cfg: DictConfig) -> None:
+def run_demo(cfg: DictConfig) -> None:
     """Runs all steps and reports."""
-    if cfg.quick:
-        cfg = OmegaConf.merge(cfg, cfg.quick_settings)
-    torch.set_num_threads(1)
     seconds: dict[str, float] = {}
 
     @contextmanager
@@ -225,6 +222,18 @@ def main(cfg: DictConfig) -> None:
     print(f"figures: {figures}")
     if left_out:
         print(left_out)
+
+
+@hydra.main(version_base=None, config_path=".", config_name="config")
+def main(cfg: DictConfig) -> None:
+    """Runs the demo, in a folder of its own."""
+    if cfg.quick:
+        overrides = HydraConfig.get().overrides.task
+        given = [text for text in overrides if not text.startswith("experiment=")]
+        cfg = OmegaConf.merge(cfg, cfg.quick_settings, OmegaConf.from_dotlist(given))
+    torch.set_num_threads(1)
+    with claim_folder(cfg.out):
+        run_demo(cfg)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ from typing import Any, Protocol, Union
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_caiac.experiments import end_with_parent
+
 __all__ = [
     "CollectionReport",
     "EpisodeArrays",
@@ -397,6 +399,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 
 def _work(factory: Callable[[], EpisodeSource], waiting: Any, finished: Any) -> None:
+    end_with_parent()
     source = None
     try:
         source = factory()
