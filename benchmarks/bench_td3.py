@@ -133,7 +133,7 @@ def measure(benchmark, function: Callable[[TensorDict], None], batch: TensorDict
 @BATCH
 @DTYPE
 @pytest.mark.parametrize("critics", ["vmap", "loop"])
-def test_step(benchmark, device, batch_size, dtype, critics):
+def bench_step(benchmark, device, batch_size, dtype, critics):
     """Whole updates; ``loop`` is the loss's ``deactivate_vmap=True``."""
     learner = Learner(dtype, device, loop=critics == "loop")
     measure(benchmark, learner.two_steps, make_batch(batch_size, device))
@@ -144,7 +144,7 @@ def test_step(benchmark, device, batch_size, dtype, critics):
 
 @DTYPE
 @pytest.mark.parametrize("part", ["update_critics", "update_actor", "soft_update"])
-def test_parts(benchmark, device, dtype, part):
+def bench_parts(benchmark, device, dtype, part):
     """Where the time of a step goes, at batch 512."""
     learner, batch = Learner(dtype, device), make_batch(512, device)
 
@@ -159,7 +159,7 @@ def test_parts(benchmark, device, dtype, part):
     measure(benchmark, function, batch)
 
 
-def test_compiled_step(benchmark, device):
+def bench_compiled_step(benchmark, device):
     """``torch.compile`` on both losses, batch 512 in bfloat16, compiling apart."""
     learner = Learner(torch.bfloat16, device, compiled=True)
     batch = make_batch(512, device)
