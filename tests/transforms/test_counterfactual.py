@@ -40,9 +40,11 @@ class FromTheFirst(CounterfactualTransform):
     def swappable(self, scores: torch.Tensor) -> torch.Tensor:
         return scores <= self.threshold
 
+    @staticmethod
     def draw_in_batch(
-        self, free: torch.Tensor, num_counterfactual: int, generator: Any
+        free: torch.Tensor, num_counterfactual: int, **settings: Any
     ) -> SwapDraw:
+        assert settings == {"window": 1, "swap_prob": 1.0, "generator": None}
         tail = free[len(free) - num_counterfactual :]
         return SwapDraw(torch.zeros_like(tail, dtype=torch.int64), tail, tail.sum(0))
 

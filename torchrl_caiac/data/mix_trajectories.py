@@ -15,6 +15,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.minari_files import whole_folder
+from torchrl_caiac.entities import _path
 
 __all__ = ["mix_trajectories"]
 
@@ -325,7 +326,3 @@ def _structure(
             )
         structure[_path(key)] = (leaf.dtype, tuple(leaf.shape[1:]))
     return structure
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)

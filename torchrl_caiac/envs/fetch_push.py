@@ -19,10 +19,10 @@ import torch
 from gymnasium_robotics.utils.rotations import mat2euler
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.envs.goal_env import make_goal_env
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
-    from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
 __all__ = [
@@ -1030,7 +1030,7 @@ class FetchPushTruth:
         target at most 5 cm off along each axis, which it does not overshoot, and cubes
         that move go on. So 8.7 cm where cubes rest; in 7,500 states, played ones and
         ones with a fast gripper beside moving cubes, no gap that an action bridged was
-        wider than 4.9 cm.
+        wider than 4.9 cm. Holding an action for several steps was not checked so.
 
         Args:
             state: ``[S]``, of :meth:`FetchPushCubes.simulator_state`.
@@ -1120,36 +1120,14 @@ def make_fetch_push_env(
         >>> rollout["next", "success"].shape, rollout["observation"].shape
         (torch.Size([3, 1]), torch.Size([3, 34]))
     """
-    from torchrl.data import Binary, Composite
-    from torchrl.envs import (
-        GymEnv,
-        InitTracker,
-        TransformedEnv,
-        default_info_dict_reader,
-    )
+    from torchrl.data import Binary
 
     register_fetch_push()
-    env = GymEnv(
-        FETCH_PUSH_ENV_ID,
-        num_cubes=num_cubes,
-        device=device,
-        disable_env_checker=True,
-        **kwargs,
-    )
     flag = functools.partial(Binary, dtype=torch.bool, device=device)
-    spec = Composite(success=flag(1), cube_success=flag(num_cubes), device=device)
-
-    class Reader(default_info_dict_reader):
-        def __call__(
-            self, info_dict: dict[str, Any], tensordict: TensorDictBase
-        ) -> TensorDictBase:
-            # TorchRL's flags are [*B, 1], gymnasium's are scalars.
-            shaped = {key: np.reshape(info_dict[key], spec[key].shape) for key in keys}
-            return super().__call__(shaped, tensordict)
-
-    keys = list(spec.keys())
-    env.set_info_dict_reader(Reader(keys, spec=spec))
-    return TransformedEnv(env, InitTracker())
+    info = {"success": flag(1), "cube_success": flag(num_cubes)}
+    return make_goal_env(
+        FETCH_PUSH_ENV_ID, info, num_cubes=num_cubes, device=device, **kwargs
+    )
 
 
 register_fetch_push()

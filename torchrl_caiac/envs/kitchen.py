@@ -29,10 +29,10 @@ from gymnasium_robotics.envs.franka_kitchen.kitchen_env import (
 )
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.envs.goal_env import make_goal_env
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
-    from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
 __all__ = [
@@ -1021,38 +1021,17 @@ def make_kitchen_env(
         >>> rollout["is_init"].flatten().tolist()
         [True, False, False]
     """
-    from torchrl.data import Binary, Composite, Unbounded
-    from torchrl.envs import (
-        GymEnv,
-        InitTracker,
-        TransformedEnv,
-        default_info_dict_reader,
-    )
+    from torchrl.data import Binary, Unbounded
 
     register_kitchen()
-    env = GymEnv(
-        KITCHEN_ENV_ID, task=task, device=device, disable_env_checker=True, **kwargs
-    )
     flag = functools.partial(Binary, dtype=torch.bool, device=device)
-    spec = Composite(
-        success=flag(1),
-        task_success=flag(1),
-        wrong_tasks=flag(len(KITCHEN_TASKS)),
-        task=Unbounded((1,), dtype=torch.int64, device=device),
-        device=device,
-    )
-
-    class Reader(default_info_dict_reader):
-        def __call__(
-            self, info_dict: dict[str, Any], tensordict: TensorDictBase
-        ) -> TensorDictBase:
-            # TorchRL's flags are [*B, 1], gymnasium's are scalars.
-            shaped = {key: np.reshape(info_dict[key], spec[key].shape) for key in keys}
-            return super().__call__(shaped, tensordict)
-
-    keys = list(spec.keys())
-    env.set_info_dict_reader(Reader(keys, spec=spec))
-    return TransformedEnv(env, InitTracker())
+    info = {
+        "success": flag(1),
+        "task_success": flag(1),
+        "wrong_tasks": flag(len(KITCHEN_TASKS)),
+        "task": Unbounded((1,), dtype=torch.int64, device=device),
+    }
+    return make_goal_env(KITCHEN_ENV_ID, info, task=task, device=device, **kwargs)
 
 
 register_kitchen()

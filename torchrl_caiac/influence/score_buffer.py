@@ -21,7 +21,7 @@ from torchrl.envs.transforms import Transform
 from tqdm.auto import tqdm
 
 from torchrl_caiac.data.trajectories import TrajectoryEnds, newest_row
-from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.entities import EntityLayout, _path
 
 __all__ = ["MarkUnscored", "score_buffer", "score_file"]
 
@@ -786,10 +786,6 @@ def _select(data: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
 def _check_int(name: str, value: int, least: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"{name} must be an int of at least {least}, got {value!r}")
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)
 
 
 def _jsonable(key: NestedKey | None) -> Any:

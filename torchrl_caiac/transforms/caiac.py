@@ -10,7 +10,6 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 from torchrl_caiac.transforms.donors import (
     RewardFn,
-    SwapDraw,
     draw_batch_donors,
     uninfluenced,
 )
@@ -117,6 +116,8 @@ class CAIACTransform(CounterfactualTransform):
                 [False,  True]])
     """
 
+    draw_in_batch = staticmethod(draw_batch_donors)
+
     def __init__(
         self,
         layout: EntityLayout,
@@ -186,27 +187,3 @@ class CAIACTransform(CounterfactualTransform):
             torch.Tensor: bool ``[B, N]``.
         """
         return self.uninfluenced(scores)
-
-    def draw_in_batch(
-        self,
-        free: torch.Tensor,
-        num_counterfactual: int,
-        generator: torch.Generator | None,
-    ) -> SwapDraw:
-        """Draws a donor for each entity, :func:`draw_batch_donors`.
-
-        Args:
-            free (torch.Tensor): bool ``[B, N]``.
-            num_counterfactual (int): how many windows become counterfactual.
-            generator (torch.Generator, optional): source of randomness.
-
-        Returns:
-            SwapDraw: the draw.
-        """
-        return draw_batch_donors(
-            free,
-            num_counterfactual,
-            window=self.window,
-            swap_prob=self.swap_prob,
-            generator=generator,
-        )

@@ -14,7 +14,7 @@ from torchrl_caiac.transforms.components import (
     draw_batch_components,
 )
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
-from torchrl_caiac.transforms.donors import RewardFn, SwapDraw
+from torchrl_caiac.transforms.donors import RewardFn
 from torchrl_caiac.transforms.window_goal import WindowGoal
 
 __all__ = ["CoDATransform"]
@@ -107,6 +107,7 @@ class CoDATransform(CounterfactualTransform):
         tensor(1.)
     """
 
+    draw_in_batch = staticmethod(draw_batch_components)
     donors_class = ComponentDonors
     _what = "graphs"
     _key_argument = "graph_key"
@@ -182,27 +183,3 @@ class CoDATransform(CounterfactualTransform):
         if self._fixed.device != scores.device:
             self._fixed = self._fixed.to(scores.device)
         return components(scores, self.threshold, window=self.window, fixed=self._fixed)
-
-    def draw_in_batch(
-        self,
-        free: torch.Tensor,
-        num_counterfactual: int,
-        generator: torch.Generator | None,
-    ) -> SwapDraw:
-        """Draws a donor for each component, :func:`draw_batch_components`.
-
-        Args:
-            free (torch.Tensor): int64 ``[B, N]``.
-            num_counterfactual (int): how many windows become counterfactual.
-            generator (torch.Generator, optional): source of randomness.
-
-        Returns:
-            SwapDraw: the draw.
-        """
-        return draw_batch_components(
-            free,
-            num_counterfactual,
-            window=self.window,
-            swap_prob=self.swap_prob,
-            generator=generator,
-        )

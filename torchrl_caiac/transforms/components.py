@@ -18,6 +18,7 @@ from torchrl_caiac.transforms.donors import (
     SwapDraw,
     TrajectoryIndex,
     _rand,
+    _scan,
 )
 
 __all__ = [
@@ -315,24 +316,12 @@ def component_starts(
     """
     length, _, entities = graphs.shape
     device = graphs.device
-    if window > 1 and trajectories is None:
-        raise ValueError("windows of several rows need the trajectories of the storage")
-    oldest = 0 if trajectories is None else trajectories.oldest
     dtype = torch.int32 if length < 1 << 31 else torch.int64
     never = _packed(fixed.to(device))
     step = min(_CHUNK, max(window, _CHUNK_ELEMENTS // (entities * (entities + 1))))
     masks = [torch.empty(0, dtype=torch.int64, device=device)]
     starts = [torch.empty(0, dtype=dtype, device=device)]
-    for begin in range(0, length - window + 1, step):
-        end = min(begin + step + window - 1, length)
-        rows = (torch.arange(begin, end, device=device) + oldest) % length
-        part = graphs[rows]
-        if torch.isinf(part).any():
-            row = int(rows[torch.isinf(part).flatten(1).any(1).nonzero()[0, 0]])
-            raise ValueError(
-                f"the graphs of the donors are infinite in row {row}: score the buffer "
-                "anew with score_buffer(..., overwrite=True)"
-            )
+    for rows, part in _scan(graphs, step, window, trajectories, "graphs"):
         links, held = _links(part, threshold)
         joined = _joined(_slid(links, window), _slid(held, window) | never)
         rows = rows[: joined.shape[0]]

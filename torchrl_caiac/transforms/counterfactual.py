@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -12,7 +13,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import ReplayBuffer, TensorStorage
 from torchrl.envs.transforms import Transform
 
-from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.entities import EntityLayout, _path
 from torchrl_caiac.transforms.donors import (
     BufferDonors,
     RewardFn,
@@ -33,7 +34,7 @@ class CounterfactualTransform(Transform, ABC):
     """Makes the last rows of a batch counterfactual, by scores that the rows carry.
 
     A subclass says what may be swapped (:meth:`swappable`) and with whom
-    (:meth:`draw_in_batch`; in :attr:`donors_class` for a donor buffer). Everything
+    (:attr:`draw_in_batch`; in :attr:`donors_class` for a donor buffer). Everything
     else is here: see :class:`~torchrl_caiac.transforms.CAIACTransform` for what a
     batch gains and for the arguments.
 
@@ -60,6 +61,8 @@ class CounterfactualTransform(Transform, ABC):
         check (bool): check the values of each batch.
     """
 
+    #: Draws among the windows of the batch, from what :meth:`swappable` gave.
+    draw_in_batch: ClassVar[Callable[..., SwapDraw]]
     donors_class: ClassVar[type[BufferDonors]] = BufferDonors
     _what: ClassVar[str] = "scores"
     _key_argument: ClassVar[str] = "score_key"
@@ -167,24 +170,6 @@ class CounterfactualTransform(Transform, ABC):
             torch.Tensor: ``[B, N]``, zero for entities that may not be swapped.
         """
 
-    @abstractmethod
-    def draw_in_batch(
-        self,
-        free: torch.Tensor,
-        num_counterfactual: int,
-        generator: torch.Generator | None,
-    ) -> SwapDraw:
-        """Draws donors among the windows of the batch.
-
-        Args:
-            free (torch.Tensor): ``[B, N]``, of :meth:`swappable`.
-            num_counterfactual (int): how many windows become counterfactual.
-            generator (torch.Generator, optional): source of randomness.
-
-        Returns:
-            SwapDraw: the draw.
-        """
-
     # --- settings and state ----------------------------------------------------------
 
     @property
@@ -262,7 +247,13 @@ class CounterfactualTransform(Transform, ABC):
                 swap_prob=self.swap_prob,
                 generator=generator,
             )
-        return self.draw_in_batch(free, count, generator)
+        return self.draw_in_batch(
+            free,
+            count,
+            window=self.window,
+            swap_prob=self.swap_prob,
+            generator=generator,
+        )
 
     def apply_parameters(
         self, tensordict: TensorDictBase, draw: SwapDraw
@@ -462,7 +453,3 @@ class CounterfactualTransform(Transform, ABC):
 def _columns(bad: torch.Tensor) -> list[int]:
     """The entities that have a bad score, ``[*, N]``."""
     return bad.reshape(-1, bad.shape[-1]).any(0).nonzero()[:, 0].tolist()
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -345,6 +345,35 @@ def trajectory_index(
     return TrajectoryIndex(length, oldest, last.nonzero()[:, 0])
 
 
+def _scan(
+    values: torch.Tensor,
+    step: int,
+    window: int,
+    trajectories: TrajectoryIndex | None,
+    what: str,
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Reads a leaf of the donors part by part, in the order of time.
+
+    A part is the rows of ``step`` windows, so that parts overlap by ``window - 1``.
+    """
+    if window > 1 and trajectories is None:
+        raise ValueError("windows of several rows need the trajectories of the storage")
+    length = values.shape[0]
+    oldest = 0 if trajectories is None else trajectories.oldest
+    for begin in range(0, length - window + 1, step):
+        end = min(begin + step + window - 1, length)
+        rows = (torch.arange(begin, end, device=values.device) + oldest) % length
+        part = values[rows]
+        infinite = torch.isinf(part)
+        if infinite.any():
+            row = int(rows[infinite.flatten(1).any(1).nonzero()[0, 0]])
+            raise ValueError(
+                f"the {what} of the donors are infinite in row {row}: score the buffer "
+                "anew with score_buffer(..., overwrite=True)"
+            )
+        yield rows, part
+
+
 def eligible_starts(
     scores: torch.Tensor,
     threshold: float,
@@ -383,22 +412,10 @@ def eligible_starts(
     """
     length, entities = scores.shape
     device = scores.device
-    if window > 1 and trajectories is None:
-        raise ValueError("windows of several rows need the trajectories of the storage")
-    oldest = 0 if trajectories is None else trajectories.oldest
     dtype = torch.int32 if length < 1 << 31 else torch.int64
     found: list[list[torch.Tensor]] = [[] for _ in range(entities)]
     chosen = swappable.nonzero()[:, 0].tolist()
-    for begin in range(0, length - window + 1, _CHUNK):
-        end = min(begin + _CHUNK + window - 1, length)
-        rows = (torch.arange(begin, end, device=device) + oldest) % length
-        part = scores[rows]
-        if torch.isinf(part).any():
-            row = int(rows[torch.isinf(part).any(1).nonzero()[0, 0]])
-            raise ValueError(
-                f"the scores of the donors are infinite in row {row}: score the buffer "
-                "anew with score_buffer(..., overwrite=True)"
-            )
+    for rows, part in _scan(scores, _CHUNK, window, trajectories, "scores"):
         free = part <= threshold
         if window > 1 and trajectories is not None:
             held = (~free).cumsum(0, dtype=torch.int32)

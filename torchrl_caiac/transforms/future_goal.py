@@ -14,7 +14,7 @@ from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers import SampleUnit
 from torchrl.envs.transforms import Transform
 
-from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.entities import EntityLayout, _path
 from torchrl_caiac.transforms.donors import (
     StorageCache,
     TrajectoryIndex,
@@ -271,7 +271,3 @@ class FutureGoal(Transform, SampleUnit):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._reset_state()
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)
