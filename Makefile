@@ -59,6 +59,7 @@ fetch-push: setup ## the comparison of arms on Fetch-Push (QUICK=1: a smoke run)
 	$(BIN)/python examples/fetch_push/study.py $(if $(QUICK),quick=true)
 
 bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --benchmark-only \
 	    --device=$(DEVICE) --benchmark-json=benchmark-$(DEVICE).json
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -37,17 +37,6 @@ BATCHES = {
 }
 MODELS = {"fetch": (FETCH, 4, 3), "kitchen": (KITCHEN, 9, 5)}
 STATES = {"cpu": 512, "cuda": 65_536}
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """One thread, denormals flushed: what the scripts do."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    yield
-    torch.set_flush_denormal(False)
-    torch.set_num_threads(threads)
 
 
 def graphs(layout: EntityLayout, rows: int) -> torch.Tensor:

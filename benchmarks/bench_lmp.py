@@ -9,7 +9,7 @@ benchmark holds the share of the step that goes to ``rb.sample()``.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -25,17 +25,6 @@ TRAJECTORIES, STEPS, D, G, A = 100, 60, 30, 21, 9
 SIZES = pytest.mark.parametrize(
     ("windows", "window"), [(128, 10), (500, 20)], ids=["128x10", "500x20"]
 )
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """One thread, denormals flushed: what the training scripts do."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    yield
-    torch.set_flush_denormal(False)
-    torch.set_num_threads(threads)
 
 
 def kitchen_layout() -> EntityLayout:

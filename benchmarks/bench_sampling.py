@@ -16,7 +16,7 @@ from __future__ import annotations
 import shutil
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -131,14 +131,6 @@ def filled(part: TensorDict, rows: int, path: Any) -> TensorStorage:
         view.update_(part)
         view["episode"].copy_(torch.arange(begin, begin + CHUNK) // EPISODE)
     return TensorStorage(data)
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(

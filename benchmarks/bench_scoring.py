@@ -8,7 +8,7 @@ actions, 3 x 256, 11 predicted columns of 3 entities) and of the kitchen (30 and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -41,17 +41,6 @@ def kitchen() -> GaussianWorldModel:
 
 
 SHAPES = pytest.mark.parametrize("make", [fetch, kitchen])
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """One thread, denormals flushed: what the scripts do."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    yield
-    torch.set_flush_denormal(False)
-    torch.set_num_threads(threads)
 
 
 def _synchronised(

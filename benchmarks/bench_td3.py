@@ -10,7 +10,7 @@ holds ``ms_per_step``, half of the fastest round.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -30,17 +30,6 @@ BATCH = pytest.mark.parametrize("batch_size", [256, 512])
 DTYPE = pytest.mark.parametrize(
     "dtype", [None, torch.bfloat16], ids=["float32", "bfloat16"]
 )
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """One thread, denormals flushed: what the training scripts do."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    yield
-    torch.set_flush_denormal(False)
-    torch.set_num_threads(threads)
 
 
 def make_batch(rows: int, device: torch.device) -> TensorDict:

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from typing import Any
+
 import pytest
 import torch
+
+from benchmarks.ratios import Judged
+
+_JUDGED = pytest.StashKey[list[Judged]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -20,3 +27,51 @@ def device(request: pytest.FixtureRequest) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise pytest.UsageError("--device=cuda, but torch sees no CUDA device")
     return torch.device(name)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """One thread, denormals flushed: what the scripts do."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    yield
+    torch.set_flush_denormal(False)
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def judge(benchmark: Any, request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Reports a ratio and its target: ``judge(name, value, at_most=1.6)``.
+
+    The ratios are listed after the run, and kept with the benchmark's other figures.
+    """
+
+    def judge(
+        name: str,
+        value: float,
+        *,
+        at_least: float | None = None,
+        at_most: float | None = None,
+    ) -> None:
+        if (at_least is None) == (at_most is None):
+            raise ValueError("a ratio has one target, at_least or at_most")
+        target = at_most if at_least is None else at_least
+        judged = Judged(name, value, target, at_least is not None)  # type: ignore[arg-type]
+        request.config.stash.setdefault(_JUDGED, []).append(judged)
+        benchmark.extra_info[name] = {
+            "ratio": round(value, 4),
+            "at_least" if judged.at_least else "at_most": target,
+            "holds": judged.holds,
+        }
+
+    return judge
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Lists the ratios, their targets, and whether they hold."""
+    judged = config.stash.get(_JUDGED, [])
+    if judged:
+        terminalreporter.section("ratios and their targets")
+        for one in judged:
+            terminalreporter.write_line(str(one))
