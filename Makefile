@@ -2,6 +2,7 @@
 PYTHON ?= python3
 WORKERS ?= 2
 DEVICE ?= cpu
+INFLUENCE ?= $(if $(QUICK),outputs/influence_quick,docs/results)
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,7 +11,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo fetch-push bench docs clean
+.PHONY: help setup test lint demo fetch-push influence bench docs clean
 
 # A stamp without its interpreter (moved folder, removed Python) does not count.
 ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
@@ -57,6 +58,14 @@ demo: setup ## the motivating experiment in the kitchen (QUICK=1: a smoke run)
 
 fetch-push: setup ## the comparison of arms on Fetch-Push (QUICK=1: a smoke run)
 	$(BIN)/python examples/fetch_push/study.py $(if $(QUICK),quick=true)
+
+influence: setup ## compare influence estimators (QUICK=1: a smoke run)
+	$(BIN)/python examples/fetch_push/compare_influence.py \
+	    study.influence=$(INFLUENCE) $(if $(QUICK),quick=true)
+	$(BIN)/python examples/franka_kitchen/compare_influence.py \
+	    demo.influence=$(INFLUENCE) $(if $(QUICK),quick=true)
+	$(BIN)/python examples/franka_kitchen/compare_influence.py experiment=all_tasks \
+	    demo.influence=$(INFLUENCE) $(if $(QUICK),quick=true)
 
 bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "bootstrap_interval",
+    "plot_comparison",
     "plot_frames",
     "plot_influence",
     "plot_learning_curves",
@@ -252,6 +253,80 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the half-open ranges in which a mask is true."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+# Title, column (or columns to add up) and axis of each panel of plot_comparison.
+_PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("AUC of the action's influence", ("auc",), "share"),
+    ("links above θ", ("density",), "share"),
+    ("counterfactual rows with a swap", ("rows_swapped",), "share"),
+    ("infeasible swaps", ("infeasible",), "share"),
+    ("seconds to fit and to score", ("fit_seconds", "score_seconds"), "log"),
+)
+
+
+def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw how influence estimators compare, one panel a measure.
+
+    Args:
+        rows: of :func:`~torchrl_caiac.influence.compare_influence`, with the name of
+            the ``"experiment"`` in each; as numbers, or as strings of a CSV file. Only
+            those over all entities are drawn; what is empty is left out.
+
+    Returns:
+        the figure.
+
+    Raises:
+        ValueError: there is no row over all entities.
+
+    Example:
+        >>> row = {"experiment": "push", "estimator": "caiac", "entity": "all"}
+        >>> figure = plot_comparison([{**row, "auc": "0.9", "rows_swapped": 0.5}])
+        >>> [len(axes.patches) for axes in figure.axes]
+        [1, 0, 1, 0, 0]
+    """
+    shown = [row for row in rows if row["entity"] == "all"]
+    if not shown:
+        raise ValueError("rows hold none over all entities: there is nothing to draw")
+    experiments = list(dict.fromkeys(row["experiment"] for row in shown))
+    estimators = list(dict.fromkeys(row["estimator"] for row in shown))
+    width = 0.8 / len(estimators)
+    figure = _figure(10.0, 5.0)
+    grid = figure.subplots(2, 3).ravel()
+    grid[-1].remove()
+    for axes, (title, columns, kind) in zip(grid, _PANELS, strict=False):
+        for row in shown:
+            values = [row.get(c) for c in columns]
+            known = [float(v) for v in values if v not in (None, "")]
+            height = sum(v for v in known if np.isfinite(v))
+            if not known or (kind == "log" and not height > 0):
+                continue
+            n = estimators.index(row["estimator"])
+            place = experiments.index(row["experiment"])
+            axes.bar(
+                place + (n - (len(estimators) - 1) / 2) * width,
+                height,
+                0.9 * width,
+                color=_COLOURS[n % len(_COLOURS)],
+            )
+        axes.set_title(title, fontsize=9)
+        axes.set_xticks(range(len(experiments)), [_label(e) for e in experiments])
+        if kind == "log" and axes.patches:
+            axes.set_yscale("log")
+        elif kind == "share":
+            axes.set_ylim(0, 1.02)
+        _plain(axes)
+    from matplotlib.patches import Patch
+
+    figure.legend(
+        handles=[
+            Patch(color=_COLOURS[n % len(_COLOURS)], label=_label(name))
+            for n, name in enumerate(estimators)
+        ],
+        loc="lower right",
+        frameon=False,
+    )
+    return figure
 
 
 def plot_success(

@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
 from torchrl_caiac.data import (
@@ -30,7 +31,9 @@ def collect(cfg: DictConfig) -> None:
     """
     settings = cfg.collect
     out = Path(cfg.out)
-    keep_settings(settings, out / "collect.json")
+    kept: dict[str, Any] = OmegaConf.to_container(settings)
+    kept.pop("workers")  # changes no result
+    keep_settings(kept, out / "collect.json")
     total = settings.expert + settings.random
     shares = [settings.expert / total, settings.random / total]
     held_out = round(settings.held_out * shares[0])

@@ -1,4 +1,7 @@
-"""Fits the Gaussian world model to the rows that are learnt from (A.7).
+"""Fits the world models to the rows that are learnt from (A.7).
+
+The Gaussian one gives CAI's scores, the transformer, for the arms ``coda`` and
+``coda_action``, those of attention.
 
 Run after ``collect.py``: ``python fit_world_model.py``. A fit that was killed goes on
 at its last checkpoint.
@@ -7,6 +10,8 @@ at its last checkpoint.
 from __future__ import annotations
 
 import logging
+import time
+from typing import Any
 
 import hydra
 import torch
@@ -14,30 +19,56 @@ from collect import load_rows, rows_folder
 from omegaconf import DictConfig
 
 from torchrl_caiac.envs import fetch_push_layout
-from torchrl_caiac.experiments import claim_folder, keep_settings
-from torchrl_caiac.modules import GaussianWorldModel
+from torchrl_caiac.experiments import claim_folder, keep_settings, write_json
+from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.objectives import fit_world_model
 
-# What the model predicts, per entity: the gripper's and fingers' positions, the cubes'.
-POSITIONS = {"gripper": 5, "cube0": 3, "cube1": 3}
+LAYOUT = fetch_push_layout(2)
+# What the models predict: the positions of the gripper and its fingers, and the cubes'.
+PREDICTED = {
+    name: LAYOUT.columns[name][:n]
+    for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
+}
 
 _LOGGER = logging.getLogger(__name__)
 
 
 def fit(cfg: DictConfig) -> GaussianWorldModel:
-    """Fits the world model, or loads it where that has been done."""
+    """Fits the Gaussian world model, or loads it where that has been done."""
     settings = cfg.world_model
-    folder = rows_folder(cfg)
-    keep_settings(settings, folder / "world_model.json")
     torch.manual_seed(settings.seed)
-    layout = fetch_push_layout(2)
     model = GaussianWorldModel(
-        layout,
+        LAYOUT,
         4,
         tuple(settings.hidden_sizes),
-        predict={name: layout.columns[name][:n] for name, n in POSITIONS.items()},
+        PREDICTED,
         variance_floor=settings.variance_floor,
     )
+    return _fitted(model, cfg, "world_model")
+
+
+def fit_transformer(cfg: DictConfig) -> TransformerWorldModel:
+    """Fits the transformer, or loads it where that has been done."""
+    settings = cfg.transformer
+    torch.manual_seed(settings.seed)
+    model = TransformerWorldModel(
+        LAYOUT,
+        4,
+        settings.layers,
+        settings.heads,
+        settings.width,
+        PREDICTED,
+        variance_floor=settings.variance_floor,
+    )
+    return _fitted(model, cfg, "transformer")
+
+
+def _fitted(model: Any, cfg: DictConfig, name: str) -> Any:
+    settings, folder = cfg[name], rows_folder(cfg)
+    keep_settings(settings, folder / f"{name}.json")
+    checkpoint = folder / name
+    new = not checkpoint.exists()
+    begin = time.process_time()
     history = fit_world_model(
         model,
         load_rows(cfg),
@@ -45,18 +76,22 @@ def fit(cfg: DictConfig) -> GaussianWorldModel:
         batch_size=settings.batch_size,
         lr=settings.lr,
         eval_every=settings.eval_every,
-        checkpoint=folder / "world_model",
+        checkpoint=checkpoint,
         checkpoint_every=settings.checkpoint_every,
         seed=settings.seed,
     )
+    if new:  # else the time of the whole fit is not known, or already kept
+        seconds = time.process_time() - begin
+        write_json(folder / f"{name}_fit.json", {"seconds": seconds})
     best = history[history["best"]][-1]
     _LOGGER.info(
-        "best validation NLL %.3f at step %d; root mean squared errors: %s",
+        "%s: best validation NLL %.3f at step %d; root mean squared errors: %s",
+        name,
         best["validation_nll"],
         best["step"],
         ", ".join(
-            f"{name} {1e3 * best['validation_mse', name].sqrt():.2g} mm"
-            for name in POSITIONS
+            f"{entity} {1e3 * best['validation_mse', entity].sqrt():.2g} mm"
+            for entity in PREDICTED
         ),
     )
     return model
@@ -64,10 +99,12 @@ def fit(cfg: DictConfig) -> GaussianWorldModel:
 
 @hydra.main(version_base=None, config_path=".", config_name="config")
 def main(cfg: DictConfig) -> None:
-    """Fits the world model."""
+    """Fits the world models that ``cfg.arm`` and ``cfg.study.arms`` need."""
     torch.set_num_threads(1)
     with claim_folder(cfg.out):
         fit(cfg)
+        if {"coda", "coda_action"} & {cfg.arm, *cfg.study.arms}:
+            fit_transformer(cfg)
 
 
 if __name__ == "__main__":

@@ -21,12 +21,16 @@ import numpy as np
 import torch
 from collect import collect, rows_folder
 from evaluate import evaluate, policy_steps
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from score import score
 from train import Arm, run_folder, train
 
-from torchrl_caiac.experiments import claim_folder, run_side_by_side, whole_file
+from torchrl_caiac.experiments import (
+    claim_folder,
+    quick_settings,
+    run_side_by_side,
+    whole_file,
+)
 from torchrl_caiac.plotting import (
     bootstrap_interval,
     plot_learning_curves,
@@ -204,9 +208,7 @@ def run_study(cfg: DictConfig) -> str:
 @hydra.main(version_base=None, config_path=".", config_name="config")
 def main(cfg: DictConfig) -> None:
     """Runs the study and prints its table."""
-    if cfg.quick:
-        given = OmegaConf.from_dotlist(list(HydraConfig.get().overrides.task))
-        cfg = OmegaConf.merge(cfg, cfg.quick_settings, given)
+    cfg = quick_settings(cfg)
     torch.set_num_threads(1)
     with claim_folder(cfg.out):
         print(run_study(cfg))

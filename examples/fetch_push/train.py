@@ -14,6 +14,7 @@ from typing import Any, Literal
 import hydra
 import torch
 from collect import load_rows, rows_folder
+from fit_world_model import LAYOUT
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
@@ -21,9 +22,9 @@ from torchrl.objectives import SoftUpdate
 from torchrl.record.loggers import get_logger
 from tqdm.auto import tqdm
 
-from torchrl_caiac import CAIACTransform
+from torchrl_caiac import CAIACTransform, CoDATransform
 from torchrl_caiac.data import offline_buffer
-from torchrl_caiac.envs import fetch_push_layout, fetch_push_reward
+from torchrl_caiac.envs import fetch_push_reward
 from torchrl_caiac.experiments import (
     TrainingCheckpoint,
     bar_position,
@@ -39,16 +40,18 @@ from torchrl_caiac.modules import (
 from torchrl_caiac.objectives import GoalConditionedTD3Loss
 from torchrl_caiac.transforms import HindsightGoal
 
-Arm = Literal["caiac", "relabel_only", "none", "oracle"]
+Arm = Literal["caiac", "coda", "coda_action", "relabel_only", "none", "oracle"]
+# The leaf of the rows that an arm takes its scores from.
+SCORE_KEYS = {
+    "caiac": ("caiac", "score"),
+    "coda": ("coda", "graph"),
+    "coda_action": ("coda", "action"),
+    "relabel_only": ("caiac", "score"),
+    "oracle": ("oracle", "score"),
+}
 
-LAYOUT = fetch_push_layout(2)
 _STATISTICS_BATCHES = 100  # from which the features' mean and deviation are taken
 _LOGGER = logging.getLogger(__name__)
-
-
-def score_key(arm: Arm) -> tuple[str, str]:
-    """The leaf of the rows that an arm takes its scores from."""
-    return ("oracle" if arm == "oracle" else "caiac", "score")
 
 
 def training_rows(data: TensorDictBase, arm: Arm) -> TensorDictBase:
@@ -59,7 +62,7 @@ def training_rows(data: TensorDictBase, arm: Arm) -> TensorDictBase:
         "action",
         "episode",
         *[("next", k) for k in ("observation", "reward", "terminated", "done")],
-        *([] if arm == "none" else [score_key(arm)]),
+        *([SCORE_KEYS[arm]] if arm in SCORE_KEYS else []),
     ]
     return data.select(*keys).clone()
 
@@ -78,15 +81,19 @@ def make_buffer(
         random=0.5 * cfg.train.counterfactual_ratio if arm == "none" else 0.0,
     )
     rb = offline_buffer(data, batch_size=cfg.train.batch_size, sample_unit=goals)
-    if arm != "none":
+    ratio = cfg.train.counterfactual_ratio
+    if arm == "coda":
+        rb.append_transform(CoDATransform(LAYOUT, cfg.coda.threshold, ratio))
+    elif arm != "none":
+        # The truth is 0 or 1, a score of CAI in nats, one of attention a share.
+        thresholds = {"oracle": 0.5, "coda_action": cfg.coda.threshold}
         rb.append_transform(
             CAIACTransform(
                 LAYOUT,
-                # The truth is 0 or 1, a score is in nats.
-                threshold=0.5 if arm == "oracle" else cfg.score.threshold,
-                counterfactual_ratio=cfg.train.counterfactual_ratio,
+                thresholds.get(arm, cfg.score.threshold),
+                ratio,
                 swap_prob=0.0 if arm == "relabel_only" else 1.0,
-                score_key=score_key(arm),
+                score_key=SCORE_KEYS[arm],
             )
         )
     rb.append_transform(goals)

@@ -12,7 +12,7 @@ from typing import Any
 
 import hydra
 from minari import MinariDataset
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_caiac.data import (
     create_kitchen_demonstrations,
@@ -54,7 +54,9 @@ def collect(cfg: DictConfig) -> None:
     """
     settings = cfg.collect
     out = Path(cfg.out)
-    keep_settings(settings, out / "collect.json")
+    kept: dict[str, Any] = OmegaConf.to_container(settings)
+    kept.pop("workers")  # changes no result
+    keep_settings(kept, out / "collect.json")
     demonstrations = PLAY_ID if settings.chains else DEMONSTRATIONS_ID
     for name, dataset_id, episodes, seed in (
         ("demonstrations", demonstrations, settings.episodes, settings.seed),

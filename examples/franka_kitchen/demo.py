@@ -22,15 +22,19 @@ import torch
 from collect import collect
 from evaluate import evaluate
 from fit_world_model import fit
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from score import score
 from train import Arm, make_buffer, train
 
 from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv, RenderingUnavailable
-from torchrl_caiac.experiments import claim_folder, run_side_by_side, write_json
+from torchrl_caiac.experiments import (
+    claim_folder,
+    quick_settings,
+    run_side_by_side,
+    write_json,
+)
 from torchrl_caiac.plotting import (
     bootstrap_interval,
     plot_frames,
@@ -151,7 +155,7 @@ def report_table(
             if (count := sum(name in r["wrong_tasks"] for r in mine))
         }
         lines.append(
-            f"  {arm:<8}{task:<15}{sum(solved) / len(solved):>6.2f} "
+            f"  {arm:<13}{task:<15}{sum(solved) / len(solved):>6.2f} "
             f"[{low:.2f}, {high:.2f}] of {len(mine)}; "
             f"{sum(r['task_success'] for r in mine) / len(mine):.2f}   "
             "wrong tasks done: "
@@ -227,10 +231,7 @@ def run_demo(cfg: DictConfig) -> None:
 @hydra.main(version_base=None, config_path=".", config_name="config")
 def main(cfg: DictConfig) -> None:
     """Runs the demo, in a folder of its own."""
-    if cfg.quick:
-        overrides = HydraConfig.get().overrides.task
-        given = [text for text in overrides if not text.startswith("experiment=")]
-        cfg = OmegaConf.merge(cfg, cfg.quick_settings, OmegaConf.from_dotlist(given))
+    cfg = quick_settings(cfg)
     torch.set_num_threads(1)
     with claim_folder(cfg.out):
         run_demo(cfg)

@@ -1,8 +1,9 @@
 """Scores every row of the demonstrations, and compares scores with the truth.
 
 Run after ``fit_world_model.py``: ``python score.py``. The learned scores go into the
-leaf ``("caiac", "score")`` of the demonstrations; ``arm=oracle`` also asks the
-simulator for their truth, ``("oracle", "score")``.
+leaf ``("caiac", "score")`` of the demonstrations. The arms ``coda`` and ``coda_action``
+also have the attention of a transformer scored, ``("coda", "graph")`` and ``("coda",
+"action")``, and ``oracle`` the simulator asked for the truth, ``("oracle", "score")``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 
 import hydra
 import torch
-from fit_world_model import fit
+from fit_world_model import fit, fit_transformer
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 
@@ -23,6 +24,7 @@ from torchrl_caiac.envs import KitchenEnv
 from torchrl_caiac.experiments import keep_settings, whole_file, write_json
 from torchrl_caiac.influence import (
     CAI,
+    AttentionInfluence,
     influence_report,
     oracle_score,
     score_buffer,
@@ -104,13 +106,21 @@ def score(cfg: DictConfig) -> dict[str, Any]:
     estimator = CAI(fit(cfg), num_actions=settings.num_actions)
     options = {"batch_size": settings.batch_size, "smoothing": settings.smoothing}
     demonstrations = load_transitions(out / "demonstrations")
-    score_buffer(
-        offline_buffer(demonstrations, batch_size=1),
-        estimator,
-        lookahead=settings.lookahead,
-        **options,
-    )
-    if "oracle" in (cfg.arm, *cfg.demo.arms):
+    rb = offline_buffer(demonstrations, batch_size=1)
+    score_buffer(rb, estimator, lookahead=settings.lookahead, **options)
+    arms = {cfg.arm, *cfg.demo.arms}
+    if arms & {"coda", "coda_action"}:
+        model = fit_transformer(cfg)
+        for name in ("graph", "action"):
+            attention = AttentionInfluence(model, action_only=name == "action")
+            score_buffer(
+                rb,
+                attention,
+                lookahead=settings.lookahead,
+                key=("coda", name),
+                **options,
+            )
+    if "oracle" in arms:
         influenced = simulator_truth(
             demonstrations,
             out / "truth.pt",

@@ -23,7 +23,7 @@ from torchrl.data import (
 from torchrl.record.loggers import get_logger
 from tqdm.auto import tqdm
 
-from torchrl_caiac import CAIACTransform
+from torchrl_caiac import CAIACTransform, CoDATransform
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
 from torchrl_caiac.experiments import (
@@ -35,8 +35,7 @@ from torchrl_caiac.modules import LMPModel
 from torchrl_caiac.objectives import LMPLoss
 from torchrl_caiac.transforms import WindowGoal
 
-Arm = Literal["caiac", "none", "oracle"]
-SCORE_KEYS = {"caiac": ("caiac", "score"), "oracle": ("oracle", "score")}
+Arm = Literal["caiac", "coda", "coda_action", "none", "oracle"]
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -62,17 +61,24 @@ def make_buffer(
         batch_size=settings.windows * settings.window,
     )
     rb.append_transform(goals)
-    if arm != "none":
+    options = {
+        "counterfactual_ratio": settings.counterfactual_ratio,
+        "swap_prob": settings.swap_prob,
+        "window": settings.window,
+    }
+    if arm == "coda":
         rb.append_transform(
-            CAIACTransform(
-                KitchenEnv.layout,
-                # The truth is 0 or 1, a score is in nats.
-                threshold=cfg.score.threshold if arm == "caiac" else 0.5,
-                counterfactual_ratio=settings.counterfactual_ratio,
-                swap_prob=settings.swap_prob,
-                window=settings.window,
-                score_key=SCORE_KEYS[arm],
-            )
+            CoDATransform(KitchenEnv.layout, cfg.coda.threshold, **options)
+        )
+    elif arm != "none":
+        threshold, key = {
+            "caiac": (cfg.score.threshold, ("caiac", "score")),
+            "coda_action": (cfg.coda.threshold, ("coda", "action")),
+            # The truth is 0 or 1, a score of CAI in nats, one of attention a share.
+            "oracle": (0.5, ("oracle", "score")),
+        }[arm]
+        rb.append_transform(
+            CAIACTransform(KitchenEnv.layout, threshold, score_key=key, **options)
         )
     return rb
 

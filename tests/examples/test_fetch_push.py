@@ -15,9 +15,11 @@ from torchrl_caiac.envs import fetch_push_reward
 from torchrl_caiac.experiments import claim_folder
 
 FOLDER = Path(__file__).parents[2] / "examples" / "fetch_push"
+ARMS = ["caiac", "coda", "coda_action", "relabel_only", "none", "oracle"]
 SMALL = {
     "collect": {"expert": 3, "random": 7, "held_out": 2, "steps": 40, "workers": 1},
     "world_model": {"steps": 60, "eval_every": 30, "hidden_sizes": [32]},
+    "transformer": {"steps": 20, "eval_every": 10, "layers": 1, "width": 16},
     "score": {"num_actions": 8},
     "truth": {"actions": 4, "oracle_actions": 3},
     "train": {
@@ -36,6 +38,7 @@ SMALL = {
 def steps():
     """The scripts of the example, as modules."""
     names = ("collect", "fit_world_model", "score", "train", "evaluate", "study")
+    names = (*names, "compare_influence")
     before = set(sys.modules)
     sys.path.insert(0, str(FOLDER))
     yield {name: importlib.import_module(name) for name in names}
@@ -49,6 +52,7 @@ def cfg(steps, tmp_path_factory):
     """A small run up to the scores."""
     cfg = OmegaConf.merge(OmegaConf.load(FOLDER / "config.yaml"), SMALL)
     cfg.out = str(tmp_path_factory.mktemp("fetch_push"))
+    cfg.study.arms = ARMS
     steps["collect"].collect(cfg)
     steps["score"].score(cfg)
     return cfg
@@ -85,16 +89,24 @@ def test_scores_and_their_report(cfg, steps):
     expert = rows["source"] == 0
     assert truth[expert][:, 1:].any()
     assert truth[expert][:, 1:].mean() > truth[~expert][:, 1:].mean()
+    graph = rows["coda", "graph"]
+    assert graph.shape == (400, 4, 3)
+    assert (graph.sum(-2) < 1.001).all() and (graph >= 0).all()
+    torch.testing.assert_close(rows["coda", "action"], graph[:, -1])
     path = steps["collect"].rows_folder(cfg) / "influence.json"
     report = json.loads(path.read_text())
     assert list(report) == ["smoothing 1", "smoothing 3"]
     assert list(report["smoothing 3"]) == ["gripper", "cube0", "cube1"]
 
 
-@pytest.mark.parametrize("arm", ["caiac", "relabel_only", "none", "oracle"])
+@pytest.mark.parametrize("arm", ARMS)
 def test_buffers_of_the_arms(arm, cfg, steps):
     train = steps["train"]
-    rows = train.training_rows(steps["collect"].load_rows(cfg), arm)
+    stored = steps["collect"].load_rows(cfg)
+    rows = train.training_rows(stored, arm)
+    cfg = cfg.copy()
+    # So small a fit pays all tokens about the same attention.
+    cfg.coda.threshold = stored["coda", "graph"].quantile(0.9).item()
     torch.manual_seed(0)
     batch = train.make_buffer(rows, cfg, arm).sample(2000)
     achieved = train.LAYOUT.achieved_goal(batch, next=True)
@@ -112,6 +124,10 @@ def test_buffers_of_the_arms(arm, cfg, steps):
     assert swapped.any() == (arm != "relabel_only")
     if arm == "oracle":
         assert not swapped[batch["oracle", "score"] > 0.5].any()
+    if arm == "coda_action":
+        assert not swapped[batch["coda", "action"] > cfg.coda.threshold].any()
+    if arm == "coda":
+        assert not swapped[batch["coda", "graph"][:, -1] > cfg.coda.threshold].any()
 
 
 def test_a_killed_training_ends_as_one_that_was_not(cfg, steps, monkeypatch):
@@ -242,6 +258,26 @@ def test_the_study(cfg, steps, tmp_path, monkeypatch):
     other.evaluate.seed = 5
     with pytest.raises(ValueError, match="other settings"):
         steps["evaluate"].evaluate(other, "none", 1)
+
+
+def test_estimators_are_compared_on_unseen_episodes(cfg, steps, tmp_path):
+    cfg = cfg.copy()
+    cfg.study.influence = str(tmp_path)
+    rows = steps["compare_influence"].compare(cfg)
+    names = ("caiac", "coda", "coda_action", "distance", "distance_action", "oracle")
+    assert [(r["estimator"], r["entity"]) for r in rows] == [
+        (name, entity) for name in names for entity in ("all", "cube0", "cube1")
+    ]
+    totals = {r["estimator"]: r for r in rows if r["entity"] == "all"}
+    # It asks about fewer of the same actions than the truth.
+    assert totals["oracle"]["false_alarms"] == 0
+    assert totals["oracle"]["rows_swapped"] > 0.9
+    assert totals["coda"]["auc"] == pytest.approx(totals["coda_action"]["auc"])
+    for name in ("caiac", "coda", "coda_action"):
+        assert totals[name]["fit_seconds"] > 0
+    assert len((tmp_path / "influence.csv").read_text().splitlines()) == 19
+    held_out = load_transitions(Path(cfg.out) / "held_out")
+    assert held_out.get("score", None) is None
 
 
 def test_a_run_that_another_process_has_begun(cfg, steps):

@@ -17,9 +17,11 @@ from torchrl_caiac.data import create_kitchen_play, load_transitions
 from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv
 
 FOLDER = Path(__file__).parents[2] / "examples" / "franka_kitchen"
+ARMS = ["none", "caiac", "coda", "coda_action", "oracle"]
 SMALL = {
     "collect": {"episodes": 2, "held_out": 1, "workers": 1},
     "world_model": {"steps": 60, "eval_every": 30, "hidden_sizes": [32]},
+    "transformer": {"steps": 10, "eval_every": 5, "layers": 1, "width": 16},
     "score": {"truth_actions": 2, "oracle_actions": 2, "num_actions": 8},
     "train": {
         "steps": 12,
@@ -36,6 +38,7 @@ SMALL = {
 def steps():
     """The scripts of the example, as modules."""
     names = ("collect", "fit_world_model", "score", "train", "evaluate", "demo")
+    names = (*names, "compare_influence")
     before = set(sys.modules)
     sys.path.insert(0, str(FOLDER))
     yield {name: importlib.import_module(name) for name in names}
@@ -49,7 +52,7 @@ def cfg(steps, tmp_path_factory):
     """A small run up to the scores."""
     cfg = OmegaConf.merge(OmegaConf.load(FOLDER / "config.yaml"), SMALL)
     cfg.out = str(tmp_path_factory.mktemp("kitchen"))
-    cfg.arm = "oracle"
+    cfg.demo.arms = ARMS
     cfg.evaluate.strips = 0
     steps["collect"].collect(cfg)
     steps["score"].score(cfg)
@@ -98,7 +101,7 @@ def test_scores_and_their_report(cfg):
     assert truth[:, KitchenEnv.layout.index("microwave")].any()
 
 
-@pytest.mark.parametrize("arm", ["none", "caiac", "oracle"])
+@pytest.mark.parametrize("arm", ARMS)
 def test_buffers_of_the_arms(arm, cfg, steps):
     data = load_transitions(Path(cfg.out) / "demonstrations")
     batch = steps["train"].make_buffer(data, cfg, arm).sample()
@@ -107,6 +110,13 @@ def test_buffers_of_the_arms(arm, cfg, steps):
         assert ("caiac", "swapped") not in batch.keys(True)
     else:
         assert batch["caiac", "counterfactual"].float().mean() == 0.5
+    if arm == "coda":
+        assert batch["coda", "graph"].shape == (160, 11, 10)
+    if arm == "coda_action":
+        held = batch["coda", "action"] > cfg.coda.threshold
+        held = held.unflatten(0, (-1, cfg.train.window)).any(1)
+        swapped = batch["caiac", "swapped"][:: cfg.train.window]
+        assert not (swapped & held).any()
 
 
 def test_a_killed_training_ends_as_one_that_was_not(cfg, steps, monkeypatch):
@@ -210,6 +220,22 @@ def test_truth_between_the_rows_that_were_asked_about(tmp_path, steps, monkeypat
     assert torch.equal(truth, whole)
 
 
+def test_estimators_are_compared_on_unseen_demonstrations(cfg, steps, tmp_path):
+    cfg = cfg.copy()
+    cfg.demo.influence = str(tmp_path)
+    rows = steps["compare_influence"].compare(cfg)
+    names = ("caiac", "coda", "coda_action", "distance", "distance_action", "oracle")
+    objects = KitchenEnv.layout.names[1:]
+    assert [(r["estimator"], r["entity"]) for r in rows] == [
+        (name, entity) for name in names for entity in ("all", *objects)
+    ]
+    by_name = {(r["estimator"], r["entity"]): r for r in rows}
+    assert by_name["oracle", "all"]["false_alarms"] == 0
+    # The hand opens the microwave at its handle.
+    assert by_name["distance_action", "microwave"]["auc"] > 0.9
+    assert len((tmp_path / "influence.csv").read_text().splitlines()) == 61
+
+
 def test_all_tasks(tmp_path, steps, monkeypatch):
     """Chains instead of single tasks, through all the steps."""
     with hydra.initialize_config_dir(str(FOLDER), version_base=None):
@@ -250,6 +276,6 @@ def test_all_tasks(tmp_path, steps, monkeypatch):
     assert not moved[list(columns["kettle"])].any()
     cfg.demo.arms = ["caiac"]
     table = steps["demo"].report_table(cfg, report, 0.5, results, {"collect": 1.0})
-    assert "caiac   kettle" in table
+    assert "caiac        kettle" in table
     steps["demo"].draw_influence(cfg, tmp_path / "influence.png")
     assert (tmp_path / "influence.png").stat().st_size > 10_000

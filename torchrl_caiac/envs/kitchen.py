@@ -319,6 +319,19 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         fixed=("robot",),
     )
     tasks: ClassVar[tuple[str, ...]] = KITCHEN_TASKS
+    #: Where the robot touches, and where each object is touched: sites of the model.
+    handles: ClassVar[dict[str, str]] = {
+        "robot": "end_effector",
+        "bottom_right_burner": "knob1_site",
+        "bottom_burner": "knob2_site",
+        "top_right_burner": "knob3_site",
+        "top_burner": "knob4_site",
+        "light_switch": "light_site",
+        "slide_cabinet": "slide_site",
+        "hinge_cabinet": "hinge_site2",
+        "microwave": "microhandle_site",
+        "kettle": "kettle_site",
+    }
 
     def __init__(
         self,
@@ -693,9 +706,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         Raises:
             RenderingUnavailable: no OpenGL context could be made.
         """
-        states = np.atleast_2d(np.asarray(states, dtype=np.float64))
-        if states.ndim != 2 or states.shape[1] != 30:
-            raise ValueError(f"states have shape {states.shape}, wanted [S, 30]")
+        states = _as_states(states)
         renderer = self._get_renderer()
         scratch = mujoco.MjData(self.model)
         frames = np.empty(
@@ -706,6 +717,31 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
             mujoco.mj_forward(self.model, scratch)
             frame[:] = renderer.frame(scratch)
         return frames
+
+    def handle_positions(self, states: ArrayLike) -> NDArray[np.float64]:
+        """Return where :attr:`handles` are, without touching the running episode.
+
+        Args:
+            states: ``[S, 30]``.
+
+        Returns:
+            positions ``[S, N, 3]`` in metres, entities in layout order.
+
+        Example:
+            >>> env = KitchenEnv()
+            >>> places = env.handle_positions(env.default_state())
+            >>> places.shape
+            (1, 10, 3)
+        """
+        states = _as_states(states)
+        sites = [self.model.site(self.handles[name]).id for name in self.layout.names]
+        scratch = mujoco.MjData(self.model)
+        positions = np.empty((len(states), len(sites), 3))
+        for position, state in zip(positions, states, strict=True):
+            scratch.qpos[:] = state
+            mujoco.mj_kinematics(self.model, scratch)
+            position[:] = scratch.site_xpos[sites]
+        return positions
 
     def close(self) -> None:
         """Free the OpenGL context, if one was made."""
@@ -975,6 +1011,13 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
                 self.model, *self.render_size, camera=DEFAULT_CAMERA_CONFIG
             )
         return self._renderer
+
+
+def _as_states(states: ArrayLike) -> NDArray[np.float64]:
+    states = np.atleast_2d(np.asarray(states, dtype=np.float64))
+    if states.ndim != 2 or states.shape[1] != 30:
+        raise ValueError(f"states have shape {states.shape}, wanted [S, 30]")
+    return states
 
 
 def _names(value: str | Iterable[str]) -> tuple[str, ...]:

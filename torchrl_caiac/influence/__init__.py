@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI, causal_action_influence
+from torchrl_caiac.influence.comparison import (
+    Candidate,
+    compare_influence,
+    publish_comparison,
+    swap_shares,
+)
 from torchrl_caiac.influence.distance import DistanceInfluence
 from torchrl_caiac.influence.score_buffer import MarkUnscored, score_buffer
 from torchrl_caiac.influence.truth import (
@@ -19,15 +25,19 @@ from torchrl_caiac.influence.truth import (
 __all__ = [
     "CAI",
     "AttentionInfluence",
+    "Candidate",
     "DistanceInfluence",
     "MarkUnscored",
     "SimulatorInfluence",
     "TrueInfluence",
     "best_threshold",
     "causal_action_influence",
+    "compare_influence",
     "influence_report",
     "oracle_score",
+    "publish_comparison",
     "roc_auc",
     "score_buffer",
+    "swap_shares",
     "true_influence",
 ]

@@ -1,0 +1,298 @@
+"""Comparing influence estimators by what is swapped because of them."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_caiac.data.offline_buffer import offline_buffer
+from torchrl_caiac.experiments import update_csv, whole_file
+from torchrl_caiac.influence.score_buffer import score_buffer
+from torchrl_caiac.influence.truth import influence_report
+
+if TYPE_CHECKING:
+    from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
+
+__all__ = [
+    "COLUMNS",
+    "Candidate",
+    "SwapShares",
+    "compare_influence",
+    "publish_comparison",
+    "swap_shares",
+]
+
+_JUDGED = ("auc", "hit_rate", "false_alarms", "best_threshold")
+#: What :func:`compare_influence` reports, in the order of the published table.
+COLUMNS = (
+    "estimator",
+    "entity",
+    "threshold",
+    *_JUDGED,
+    "infeasible",
+    "density",
+    "rows_swapped",
+    "fit_seconds",
+    "score_seconds",
+)
+
+
+class Candidate(NamedTuple):
+    """An estimator, and the transform that would read its scores.
+
+    Attributes:
+        estimator: as :func:`~torchrl_caiac.influence.score_buffer` takes it; of the
+            action's influence ``[n, N]``, or of graphs ``[n, N + 1, N]``.
+        transform: a :class:`~torchrl_caiac.CAIACTransform` or a
+            :class:`~torchrl_caiac.CoDATransform` of one-row windows with donors in the
+            batch. Its threshold is θ; its keys do not matter.
+        smoothing: as in :func:`~torchrl_caiac.influence.score_buffer`.
+        fit_seconds: what fitting took, to be reported; NaN where it is not known.
+    """
+
+    estimator: Callable[[TensorDictBase], torch.Tensor]
+    transform: CounterfactualTransform
+    smoothing: int = 1
+    fit_seconds: float = math.nan
+
+
+class SwapShares(NamedTuple):
+    """What was swapped, and how much of it cannot have happened.
+
+    Attributes:
+        rows: the share of counterfactual rows in which something is swapped.
+        infeasible: the share of swaps whose entity the action did move, in its own row
+            or in the donor's; float64 ``[N]``, NaN where an entity is never swapped.
+        infeasible_total: the same over all entities.
+    """
+
+    rows: float
+    infeasible: torch.Tensor
+    infeasible_total: float
+
+
+def swap_shares(
+    transform: CounterfactualTransform,
+    scores: torch.Tensor,
+    influenced: torch.Tensor,
+    *,
+    batch_size: int = 512,
+    batches: int = 200,
+    seed: int = 0,
+) -> SwapShares:
+    """Judges the swaps of a transform by the true influence.
+
+    A swap is infeasible where the truth says that the action controlled the swapped
+    entity: what it did there belongs to the action, which is not swapped.
+
+    Args:
+        transform (CounterfactualTransform): of one-row windows, donors in the batch.
+        scores (torch.Tensor): what the transform reads, ``[T, *feature_shape]``.
+        influenced (torch.Tensor): the truth, bool ``[T, N]``.
+
+    Keyword Args:
+        batch_size (int): rows a batch. Defaults to 512.
+        batches (int): how many are drawn. Defaults to 200.
+        seed (int): of the draws. Defaults to 0.
+
+    Returns:
+        SwapShares: the shares.
+
+    Raises:
+        ValueError: the transform has windows or a donor buffer; shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac import CAIACTransform, EntityLayout
+        >>> from torchrl_caiac.influence.comparison import swap_shares
+        >>> layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
+        >>> truth = torch.tensor([[True, False], [True, True]]).repeat(50, 1)
+        >>> swap_shares(CAIACTransform(layout), truth.float(), truth).infeasible_total
+        0.0
+    """
+    if transform.window != 1 or transform.donors is not None:
+        raise ValueError(
+            f"the transform has windows of {transform.window} rows and donors "
+            f"{transform.donors!r}: give one of single rows with donors in the batch"
+        )
+    wanted = (len(influenced), *transform.feature_shape)
+    if tuple(scores.shape) != wanted or influenced.shape[1:] != wanted[-1:]:
+        raise ValueError(
+            f"scores and influenced have shapes {list(scores.shape)} and "
+            f"{list(influenced.shape)}, wanted {list(wanted)} and [T, {wanted[-1]}]"
+        )
+    generator = torch.Generator().manual_seed(seed)
+    rows = total = 0
+    swaps = torch.zeros(wanted[-1], dtype=torch.int64)
+    bad = torch.zeros(wanted[-1], dtype=torch.int64)
+    for _ in range(batches):
+        choice = torch.randint(len(scores), (batch_size,), generator=generator)
+        draw = transform.generate_parameters(scores[choice], generator)
+        truth = influenced[choice]
+        own = truth[batch_size - len(draw.swapped) :]
+        given = truth.gather(0, draw.donors.where(draw.swapped, 0))
+        rows += int(draw.swapped.any(-1).sum())
+        total += len(draw.swapped)
+        swaps += draw.swapped.sum(0)
+        bad += (draw.swapped & (own | given)).sum(0)
+    return SwapShares(
+        rows / total if total else math.nan,
+        bad.double() / swaps,
+        (bad.sum().double() / swaps.sum()).item(),
+    )
+
+
+def compare_influence(
+    data: TensorDictBase,
+    influenced: torch.Tensor,
+    candidates: Mapping[str, Candidate],
+    *,
+    batch_size: int = 4096,
+    seed: int = 0,
+    progress: bool = True,
+) -> list[dict[str, Any]]:
+    """Compares estimators on the same rows, by the truth.
+
+    Args:
+        data (TensorDictBase): transitions ``[T]`` of whole trajectories, with what the
+            estimators read; they stay as they are.
+        influenced (torch.Tensor): the truth about each row's state, bool ``[T, N]``,
+            of :func:`~torchrl_caiac.influence.true_influence`.
+        candidates (mapping of str to Candidate): the estimators by name.
+
+    Keyword Args:
+        batch_size (int): states scored at once. Defaults to 4096.
+        seed (int): of the swaps that are tried. Defaults to 0.
+        progress (bool): show progress bars. Defaults to ``True``.
+
+    Returns:
+        list of dict: for each estimator one with ``"entity": "all"``, and one for each
+        entity that may be swapped. All have ``"estimator"``; ``"threshold"``, θ;
+        ``"auc"``, ``"hit_rate"``, ``"false_alarms"`` and ``"best_threshold"`` of the
+        action's influence (:func:`~torchrl_caiac.influence.influence_report`; for all,
+        the mean over entities that have an AUC); and ``"infeasible"``, the share of
+        swaps (:func:`swap_shares`). For all, also ``"density"``, the share of links
+        above θ among those that the estimator scores; ``"rows_swapped"``;
+        ``"fit_seconds"``; and ``"score_seconds"``, processor time for all rows.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import CAIACTransform, EntityLayout
+        >>> from torchrl_caiac.influence import DistanceInfluence
+        >>> from torchrl_caiac.influence.comparison import Candidate, compare_influence
+        >>> layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
+        >>> rule = DistanceInfluence(layout, {"arm": [0], "cup": [1]}, action_only=True)
+        >>> state = torch.rand(60, 2)
+        >>> data = TensorDict({
+        ...     "observation": state, "episode": torch.arange(60) // 20,
+        ...     "next": {"observation": state,
+        ...              "done": (torch.arange(60) % 20 == 19)[:, None]}}, [60])
+        >>> near = (state - state[:, :1]).abs() <= 0.1
+        >>> rows = compare_influence(
+        ...     data, near, {"distance": Candidate(rule, CAIACTransform(layout, 0.5))},
+        ...     progress=False)
+        >>> [(row["entity"], row["auc"], row["infeasible"]) for row in rows]
+        [('all', 1.0, 0.0), ('cup', 1.0, 0.0)]
+    """
+    rows = []
+    for name, candidate in candidates.items():
+        transform = candidate.transform
+        layout, theta = transform.layout, transform.threshold
+        rb = offline_buffer(data.clone(), batch_size=1)
+        begin = _cpu_seconds()
+        score_buffer(
+            rb,
+            candidate.estimator,
+            batch_size=batch_size,
+            smoothing=candidate.smoothing,
+            lookahead=0,
+            key="score",
+            progress=progress,
+        )
+        seconds = _cpu_seconds() - begin
+        scores = rb.storage[:]["score"]
+        report: dict[str, Any] = dict(
+            influence_report(
+                scores if scores.ndim == 2 else scores[:, -1],
+                influenced,
+                layout.names,
+                threshold=theta,
+            )
+        )
+        swaps = swap_shares(transform, scores, influenced, seed=seed)
+        common = {"estimator": name, "threshold": theta}
+        entities: list[dict[str, Any]] = [
+            {
+                **common,
+                "entity": entity,
+                **{key: report[entity][key] for key in _JUDGED},
+                "infeasible": swaps.infeasible[layout.index(entity)].item(),
+            }
+            for entity in layout.names
+            if entity not in layout.fixed
+        ]
+        judged = [row for row in entities if not math.isnan(row["auc"])]
+        rows.append(
+            {
+                **common,
+                "entity": "all",
+                **{
+                    key: fmean(row[key] for row in judged) if judged else math.nan
+                    for key in _JUDGED
+                },
+                "infeasible": swaps.infeasible_total,
+                "density": _density(scores, layout.fixed_mask, theta),
+                "rows_swapped": swaps.rows,
+                "fit_seconds": candidate.fit_seconds,
+                "score_seconds": seconds,
+            }
+        )
+        rows += entities
+    return rows
+
+
+def publish_comparison(
+    folder: str | Path, rows: Sequence[Mapping[str, Any]], *, experiment: str
+) -> None:
+    """Writes a comparison to ``influence.csv``, and draws ``influence.png``.
+
+    Several experiments share the files: each call replaces the rows of its own.
+
+    Args:
+        folder (str or Path): where the files are.
+        rows (sequence of dict): of :func:`compare_influence`.
+
+    Keyword Args:
+        experiment (str): the name of the data, the table's first column.
+    """
+    from torchrl_caiac.plotting import plot_comparison
+
+    table = update_csv(
+        Path(folder) / "influence.csv", rows, COLUMNS, experiment=experiment
+    )
+    with whole_file(Path(folder) / "influence.png") as partial:
+        plot_comparison(table).savefig(partial, dpi=150)
+
+
+def _cpu_seconds() -> float:
+    """Processor time of this process and of its children that have ended."""
+    return time.process_time() + sum(os.times()[2:4])
+
+
+def _density(scores: torch.Tensor, fixed: torch.Tensor, threshold: float) -> float:
+    """The share of scored links that are there."""
+    if scores.ndim == 2:  # the action always moves what is fixed
+        scored = (~fixed).expand_as(scores)
+    else:  # nor is an entity's link to itself one
+        n = scores.shape[-1]
+        scored = (~torch.eye(n + 1, n, dtype=torch.bool)).expand_as(scores)
+    return (scores[scored] > threshold).double().mean().item()
