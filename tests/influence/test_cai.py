@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Unbounded
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence import cai
+from torchrl_caiac.influence import cai, mixture_divergence
 from torchrl_caiac.influence.cai import CAI, causal_action_influence, draw_actions
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
@@ -402,6 +403,10 @@ def test_wrong_arguments_are_named() -> None:
         ({"num_actions": 1}, "num_actions .* got 1"),
         ({"approximation": "mean"}, "'mean'"),
         ({"max_memory": 0}, "max_memory"),
+        ({"mode": "quick"}, "'quick'"),
+        ({"mode": "fast"}, "needs the threshold .* got None"),
+        ({"mode": "fast", "threshold": 0.0}, "above 0, got 0.0"),
+        ({"mode": "fast", "threshold": 1.0, "num_actions": 16}, "num_actions=16"),
         ({"action_spec": Bounded(-1, 1, (3,))}, r"shape \[3\].*\[2\]"),
         ({"action_spec": Bounded(-1, 1, (4, 2))}, r"shape \[4, 2\]"),
         ({"action_spec": Bounded(-math.inf, 1, (2,))}, "infinite bounds"),
@@ -463,12 +468,161 @@ def test_peak_memory_stays_far_below_a_gibibyte() -> None:
 
 def test_memory_limit_bounds_the_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     # As on a GPU, where only max_memory limits the chunks.
-    monkeypatch.setattr(cai, "_CPU_PAIR_BYTES", 2**40)
-    monkeypatch.setattr(cai, "_CPU_NETWORK_ROWS", 2**40)
+    monkeypatch.setattr(mixture_divergence, "_CPU_PAIR_BYTES", 2**40)
+    monkeypatch.setattr(cai, "_CPU_GAUSSIAN_BYTES", 2**40)
+    monkeypatch.setattr(cai, "_CPU_NETWORK_BYTES", 2**40)
     model = trained()
     estimator = CAI(model, num_actions=16, max_memory=2**20)
-    rows, actions = estimator._chunk()
-    assert actions == 16 and rows * 16 * 4 * 3 * 16 <= 2**19
+    assert 1 < estimator._states_at_once(16) * 16 * 4 * 5 <= 2**18
     torch.testing.assert_close(
         estimator(states(300)), CAI(model, num_actions=16)(states(300))
     )
+
+
+@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+def test_compiled_estimator_agrees_with_the_other(approximation: Any) -> None:
+    model = trained(predict={"arm": [0]})  # entities of one and of three columns
+    kwargs: dict[str, Any] = {"num_actions": 20, "approximation": approximation}
+    slow = CAI(model, compile=False, **kwargs)(states(70))
+    for max_memory in (1, 2**17, 2**28):
+        fused = CAI(model, compile=True, max_memory=max_memory, **kwargs)(states(70))
+        torch.testing.assert_close(fused, slow, atol=1e-6, rtol=1e-5)
+
+
+def test_enough_states_are_worth_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    fused = []
+
+    def influence(loc: Any, var: Any, slices: Any, **kwargs: Any) -> torch.Tensor:
+        fused.append(kwargs["fused"])
+        return torch.zeros(len(loc), len(slices))
+
+    monkeypatch.setattr(cai, "mixture_influence", influence)
+    monkeypatch.setattr(mixture_divergence, "_LEAST_PAIRS", 10 * 2 * 6 * 6)
+    CAI(trained(), num_actions=6)(states(9))
+    CAI(trained(), num_actions=6)(states(10))
+    CAI(trained(), num_actions=6, compile=False)(states(10))
+    CAI(trained(), num_actions=6, compile=True)(states(2))
+    estimator = CAI(trained(), num_actions=6)
+    estimator.prepare(states(4), 10)  # told of more
+    estimator(states(2))
+    assert fused == [False, True, False, True, True]
+
+
+# --- the fast mode -------------------------------------------------------------------
+
+
+def gated() -> GaussianWorldModel:
+    """A model in which the first column says how much of the cup an action moves.
+
+    None at 0, all at 1, and from 0.98 on more and more.
+    """
+    model = GaussianWorldModel(LAYOUT, 2, (1,))
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.zero_()
+        model.hidden[0].weight[0, 0] = 100.0
+        model.hidden[0].weight[0, 5] = 1.0
+        model.hidden[0].bias.fill_(-99.0)
+        model.loc_head.weight[2, 0] = 3.0
+    return model
+
+
+def gates(rows: int, near: float) -> TensorDict:
+    """States of which few, most or all have some influence."""
+    generator = torch.Generator().manual_seed(2)
+    observation = torch.zeros(rows, 5)
+    draw = torch.rand(rows, generator=generator)
+    observation[draw > 0.8, 0] = 1.0
+    between = draw < near
+    amount = torch.rand(rows, generator=generator)
+    observation[between, 0] = 0.98 + 0.02 * amount[between]
+    return TensorDict({"observation": observation}, [rows])
+
+
+def test_fast_mode_is_exact_where_it_matters(caplog: pytest.LogCaptureFixture) -> None:
+    model, td = gated(), gates(6_000, 0.2)
+    exact = CAI(model)(td)
+    fast = CAI(model, mode="fast", threshold=0.1)
+    with caplog.at_level("INFO", "torchrl_caiac.cai"):
+        scores = fast(td)
+    assert "fast mode: states with scores from" in caplog.text
+    assert fast._near is not None
+    low, high = fast._near
+    below = scores <= 0.1
+    assert 0.2 < below[:, 1].float().mean() < 0.95
+    assert (below == (exact <= 0.1)).double().mean() >= 0.999
+    near = (scores[:, 1] > low) & (scores[:, 1] < high)
+    assert near.any() and not near.all()
+    torch.testing.assert_close(scores[near], exact[near])
+    # Elsewhere they are estimates, by other actions.
+    assert not torch.equal(scores, exact)
+    error = (scores - exact).abs()
+    assert (error <= 0.02 + 0.3 * exact).all()
+    # A second call does not look around again, and finds the same.
+    assert torch.equal(fast(td[:100]), scores[:100])
+
+
+def test_fast_mode_makes_more_exact_for_means_over_states() -> None:
+    fast = CAI(gated(), mode="fast", threshold=0.1)
+    td = gates(3_000, 0.2)
+    fast.prepare(td, 3_000)
+    assert fast._near is not None
+    low, high = fast._near
+    fast.prepare(td, 3_000, smoothing=10)
+    assert fast._near == pytest.approx((low, 10 * high))
+
+
+def test_fast_mode_falls_back_where_its_masks_are_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model, td = gated(), gates(500, 0.8)
+    # A first look that sees nothing.
+    monkeypatch.setattr(cai, "_spread", lambda actions, count: [0] * count)
+    fast = CAI(model, mode="fast", threshold=0.1)
+    with pytest.warns(RuntimeWarning, match=r"cannot be used: .* wanted 99\.95%"):
+        scores = fast(td)
+    assert torch.equal(scores, CAI(model)(td))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(fast(td), scores)
+
+
+def test_fixed_entities_may_be_near() -> None:
+    layout = EntityLayout(LAYOUT.columns, fixed=("cup",))
+    model = GaussianWorldModel(layout, 2, (1,))
+    fast = CAI(model, mode="fast", threshold=0.1)
+    scores = torch.tensor([[0.0, 0.1], [0.1, 0.0], [0.3, 0.3]])
+    assert fast._any_within(scores, (0.05, 0.2)).tolist() == [False, True, False]
+
+
+def test_first_look_is_by_actions_far_from_each_other() -> None:
+    actions = draw_actions(64, -torch.ones(2), torch.tensor([1.0, 99.0]))
+    chosen = cai._spread(actions, 16)
+    assert len(set(chosen)) == 16
+    unit = actions / actions.std(0)
+    apart = torch.cdist(unit[chosen], unit[chosen]).fill_diagonal_(9).min()
+    first = torch.cdist(unit[:16], unit[:16]).fill_diagonal_(9).min()
+    assert apart > 2 * first
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_fast_mode_passes_over_what_is_not_finite_until_it_is_scored(
+    bad: float,
+) -> None:
+    td = gates(50, 0.2)
+    td["observation"][7, 1] = bad
+    fast = CAI(gated(), mode="fast", threshold=0.1)
+    fast.prepare(td, 50)
+    with pytest.raises(ValueError, match="in row 7"):
+        fast(td)
+    fast.prepare(td[7:8], 1)
+    assert fast(td[:5]).shape == (5, 2)
+
+
+def test_modes_are_told_apart() -> None:
+    model = gated()
+    assert repr(CAI(model)) != repr(CAI(model, mode="fast", threshold=0.1))
+    assert "mode='fast', threshold=0.1" in repr(
+        CAI(model, mode="fast", threshold=0.1, compile=True)
+    )
+    assert repr(CAI(model)) == repr(CAI(model, compile=True))

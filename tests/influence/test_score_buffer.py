@@ -736,3 +736,82 @@ def test_the_bar_counts_the_rows(capsys):
 
 def test_the_folder_is_named_after_the_key():
     assert score_file("x", ("coda", "graph")) == Path("x/coda.graph.json")
+
+
+# --- estimators that look at the data first ------------------------------------------
+
+
+class Prepared(Read):
+    """Keeps what it is told before it scores."""
+
+    def __init__(self):
+        super().__init__()
+        self.told = []
+
+    def prepare(self, states, num_states, *, smoothing):
+        assert not self.rows
+        self.told.append((states["observation"].clone(), num_states, smoothing))
+
+
+def test_an_estimator_is_shown_states_of_the_whole_buffer(monkeypatch):
+    module = sys.modules["torchrl_caiac.influence.score_buffer"]
+    monkeypatch.setattr(module, "_SAMPLE", 5)
+    rows = episodes([40, 41])
+    rb = filled(rows, size=100)
+    estimator = Prepared()
+    score_buffer(rb, estimator, 8, smoothing=3, progress=False)
+    ((shown, num_states, smoothing),) = estimator.told
+    assert torch.equal(shown, rows["observation"][::20])
+    assert (num_states, smoothing) == (81, 3)
+    # There is nothing left to score.
+    score_buffer(rb, estimator, 8, smoothing=3, progress=False)
+    assert len(estimator.told) == 1
+
+
+def test_modes_of_cai_are_never_mixed():
+    layout = EntityLayout({"arm": [0], "cup": [1, 2]})
+    model = GaussianWorldModel(layout, 2, (8,))
+    rb = filled(episodes([20, 20]))
+    fast = {"mode": "fast", "threshold": 1e-4}
+    score_buffer(rb, CAI(model, **fast), progress=False)
+    score_buffer(rb, CAI(model, compile=False, **fast), progress=False)
+    for other in (CAI(model), CAI(model, mode="fast", threshold=1e-3)):
+        with pytest.raises(ValueError, match="made with other settings: estimator"):
+            score_buffer(rb, other, progress=False)
+
+
+def test_fast_scores_that_were_taken_up_again_are_the_same():
+    layout = EntityLayout({"arm": [0], "cup": [1, 2]})
+    torch.manual_seed(0)
+    model = GaussianWorldModel(layout, 2, (8,))
+    rows = episodes([60, 60, 60])
+
+    def estimator():
+        return CAI(model, mode="fast", threshold=1e-4)
+
+    once, twice = filled(rows), filled(rows)
+    score_buffer(once, estimator(), 32, 3, progress=False)
+    killed = estimator()
+    score, calls = killed._score, []
+
+    def dies(states, near):
+        calls.append(len(states))
+        if len(calls) > 6:  # two to look around, four blocks and their last states
+            raise KeyboardInterrupt
+        return score(states, near)
+
+    killed._score = dies
+    with pytest.raises(KeyboardInterrupt):
+        score_buffer(twice, killed, 32, 3, progress=False)
+    assert 0 < scores(twice).isnan().float().mean() < 1
+    score_buffer(twice, estimator(), 32, 3, progress=False)
+    assert torch.equal(scores(twice), scores(once))
+
+
+def test_rows_that_are_not_finite_are_named_by_their_place():
+    layout = EntityLayout({"arm": [0], "cup": [1, 2]})
+    rows = episodes([20, 20])
+    rows["observation"][33, 1] = torch.nan
+    fast = CAI(GaussianWorldModel(layout, 2, (8,)), mode="fast", threshold=1e-4)
+    with pytest.raises(ValueError, match=r"state of the rows \[33\]"):
+        score_buffer(filled(rows), fast, progress=False)

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel, _softplus
 
 LAYOUT = EntityLayout({"arm": [0, 1, 4], "cup": [6, 5], "lid": [2]})
 
@@ -94,6 +94,49 @@ def test_broadcast_actions_give_what_expanded_ones_give() -> None:
     loc, var = model.forward_tensors(state, action)
     slow = model.forward_tensors(state.expand(5, 7, 6), action.expand(5, 7, 2))
     torch.testing.assert_close((loc, var), slow, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("onednn", [True, False])
+@pytest.mark.parametrize("rows", [1, 5, 1024])
+def test_predictions_for_the_same_actions(
+    dtype: torch.dtype, onednn: bool, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = GaussianWorldModel(LAYOUT, 2, (16, 8), spectral_norm=True, max_variance=1.0)
+    td = transitions(100)
+    model(td)
+    model.fit_statistics(td)
+    model = model.to(dtype).eval()
+    state, action = torch.randn(9, 6), torch.randn(7, 2)
+    slow = model.forward_tensors(state[:, None], action[None])
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: onednn)
+    predict = model.for_actions(action, rows=rows)
+    out = predict(state)
+    assert out[0].dtype == dtype and out[0].shape == (9, 7, 6)
+    torch.testing.assert_close(out, slow, atol=1e-6, rtol=1e-5)
+    assert not any(x.requires_grad for x in out)
+    assert [x.shape for x in predict(state[:0])] == [(0, 7, 6)] * 2
+    with pytest.raises(ValueError, match=r"\[B, 6\], got \[9, 5\]"):
+        predict(state[:, :5])
+
+
+def test_predictions_for_the_same_actions_learn_nothing() -> None:
+    model = GaussianWorldModel(LAYOUT, 2, (16, 8))
+    model(transitions(100))
+    counts = [norm.count.clone() for norm in (model.state_norm, model.action_norm)]
+    action = torch.randn(3, 2)
+    model.for_actions(action)(torch.randn(4, 6))
+    assert model.training and model.state_norm.training
+    assert [model.state_norm.count, model.action_norm.count] == counts
+    with pytest.raises(ValueError, match="expected"):
+        model.for_actions(action[:, :1])
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
+def test_softplus_is_that_of_torch(scale: float) -> None:
+    x = scale * torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    expected = torch.nn.functional.softplus(x.double()).float()
+    torch.testing.assert_close(_softplus(x), expected, atol=0, rtol=1e-6)
 
 
 def test_first_layer_is_a_plain_linear_layer_of_the_normalised_input() -> None:

@@ -28,6 +28,7 @@ __all__ = ["MarkUnscored", "score_buffer", "score_file"]
 _FORMAT = "torchrl_caiac.scores"
 _VERSION = 1
 _NAMED = 8  # rows named in an error
+_SAMPLE = 4096  # states that an estimator may look at before it scores
 
 
 class MarkUnscored(Transform):
@@ -156,7 +157,10 @@ def score_buffer(
         estimator (callable): maps states, a tensordict ``[n]``, to scores ``[n, N]``
             (or ``[n, N + 1, N]``), each row on its own; with the ``layout``
             (:class:`EntityLayout`) that it, or its ``model``, reads. Its ``in_keys``,
-            where it has some, are the keys it is given, else those of the layout.
+            where it has some, are the keys it is given, else those of the layout. Its
+            method ``prepare(states, num_states, smoothing=...)``, where it has one, is
+            called before it scores, with up to 4,096 states spread over the buffer and
+            the number of rows.
         batch_size (int): states scored at once. Defaults to 4096.
         smoothing (int): width of the box in states. Defaults to 1: no smoothing.
 
@@ -354,6 +358,7 @@ class _Scorer:
         self.num_blocks = -(-self.length // batch_size)
         self.feature_shape: tuple[int, ...] | None = None
         self._device = _device(estimator)
+        self._is_prepared = False
         self._blocks: dict[int, tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = {}
 
     def rows(self, c: int) -> range:
@@ -441,9 +446,22 @@ class _Scorer:
         first = self.past if self.ends.wraps else min(self.past, own.start)
         return best[place[first : first + len(own)]]
 
+    def _prepare(self) -> None:
+        """Shows the estimator what is coming, the same in a call taken up again."""
+        prepare = getattr(self.estimator, "prepare", None)
+        if prepare is not None and not self._is_prepared:
+            count = min(self.length, _SAMPLE)
+            rows = torch.linspace(0, self.length - 1, count, dtype=torch.float64).long()
+            sample = self.states[rows.to(self.states.device or "cpu")]
+            if self._device is not None:
+                sample = sample.to(self._device)
+            prepare(sample, self.length, smoothing=self.past + self.future + 1)
+        self._is_prepared = True
+
     def _evaluate(
         self, states: TensorDictBase, rows: torch.Tensor, what: str
     ) -> torch.Tensor:
+        self._prepare()
         # A copy: the estimator may write into what it is given.
         states = states.clone()
         if self._device is not None:
