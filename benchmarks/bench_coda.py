@@ -3,20 +3,13 @@
 Run with ``pytest benchmarks/bench_coda.py`` (``make bench``). The batches are those of
 ``bench_sampling.py``: 512 transitions of Fetch-Push (3 entities) and 500 windows of 20
 rows of the kitchen (10 entities), donors from the batch or from 100 k stored rows; the
-transforms are timed alone, without sampling. ``extra_info["ratio"]`` is CoDA's time
-against CAIAC's on the same batch, both at their fastest, so that what else the machine
-does hardly counts; the target is at most 3.
-
-For scoring, ``states_per_s`` is that of the attention or of the model's plain forward
-pass, in chunks of the same size, and ``share`` the former against the latter, at least
-0.5.
+transforms are timed alone, without sampling, on the same batch. With
+``--device=cuda`` batches and donors lie on the GPU. For scoring, the rate is that of
+the attention against the model's plain forward pass, in chunks of the same size.
 """
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -26,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import TensorStorage
 
 from benchmarks.bench_sampling import CHUNK, EPISODE, FETCH, KITCHEN, chunk
+from benchmarks.ratios import seconds
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.influence import AttentionInfluence
 from torchrl_caiac.modules import TransformerWorldModel
@@ -48,26 +42,6 @@ def graphs(layout: EntityLayout, rows: int) -> torch.Tensor:
     return graph.repeat_interleave(EPISODE, 0)
 
 
-def synchronised(call: Callable[[], Any], device: torch.device) -> Callable[[], None]:
-    def run() -> None:
-        call()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-
-    return run
-
-
-def ratio(one: Callable[[], Any], other: Callable[[], Any], rounds: int) -> float:
-    """The time of one call in that of the other, each at its fastest."""
-    best = [math.inf, math.inf]
-    for _ in range(rounds):
-        for i, call in enumerate((one, other)):
-            begin = time.perf_counter()
-            call()
-            best[i] = min(best[i], time.perf_counter() - begin)
-    return best[0] / best[1]
-
-
 def drawn(data: TensorDictBase, window: int, windows: int) -> TensorDictBase:
     """A batch of windows, each of one episode."""
     generator = torch.Generator().manual_seed(2)
@@ -76,11 +50,10 @@ def drawn(data: TensorDictBase, window: int, windows: int) -> TensorDictBase:
     return data[(episode * EPISODE + start + torch.arange(window)).flatten()]
 
 
-@pytest.mark.parametrize("kind", ["caiac", "coda"])
 @pytest.mark.parametrize("donors", ["batch", "buffer"])
 @pytest.mark.parametrize("name", BATCHES)
 def bench_transform(
-    benchmark: Any, name: str, donors: str, kind: str, device: torch.device
+    benchmark: Any, judge: Any, name: str, donors: str, device: torch.device
 ) -> None:
     """Either transform on the same batch."""
     layout, width, action, goals, window, windows = BATCHES[name]
@@ -88,22 +61,27 @@ def bench_transform(
     part["coda", "graph"] = graphs(layout, CHUNK)
     stored = torch.cat([part] * (DONOR_ROWS // CHUNK))
     stored["episode"] = torch.arange(DONOR_ROWS) // EPISODE
-    storage = None if donors == "batch" else TensorStorage(stored)
     batch = drawn(stored, window, windows).to(device)
-    caiac, coda = (
-        synchronised(
-            partial(made(layout, window=window, donors=storage), batch), device
-        )
+    storage = None
+    if donors == "buffer":
+        storage = TensorStorage(stored.to(device), device=device)
+    calls = {
+        made.__name__: partial(made(layout, window=window, donors=storage), batch)
         for made in (CAIACTransform, CoDATransform)
+    }
+    times = seconds(calls, rounds=200, warmup=10)
+    judge(
+        f"CoDA / CAIAC, {name}, donors from the {donors}",
+        times["CoDATransform"] / times["CAIACTransform"],
+        at_most=3,
     )
-    benchmark.group = f"{name}, donors from the {donors}"
-    benchmark.extra_info["target"] = 3.0
-    benchmark.extra_info["ratio"] = round(ratio(coda, caiac, 200), 2)
-    benchmark.pedantic(caiac if kind == "caiac" else coda, rounds=200, warmup_rounds=5)
+    benchmark.pedantic(calls["CoDATransform"], rounds=50)
 
 
 @pytest.mark.parametrize("name", MODELS)
-def bench_attention(benchmark: Any, name: str, device: torch.device) -> None:
+def bench_attention(
+    benchmark: Any, judge: Any, name: str, device: torch.device
+) -> None:
     """Scoring with attention, and the same rows through the model alone."""
     layout, action_dim, layers = MODELS[name]
     model = TransformerWorldModel(layout, action_dim, layers).to(device).eval()
@@ -124,11 +102,12 @@ def bench_attention(benchmark: Any, name: str, device: torch.device) -> None:
         for part in td.split(estimator.chunk_rows):
             model.forward_tensors(layout.read(part), part["action"])
 
-    plain = synchronised(forward, device)
-    score = synchronised(lambda: estimator(td), device)
-    benchmark.group = "scoring"
-    benchmark.extra_info["target"] = 0.5
-    benchmark.extra_info["share"] = round(ratio(plain, score, 10), 2)
-    benchmark.pedantic(score, rounds=5)
-    if benchmark.stats is not None:  # None where benchmarks are disabled
-        benchmark.extra_info["states_per_s"] = rows / benchmark.stats.stats.median
+    score = partial(estimator, td)
+    times = seconds({"plain": forward, "score": score}, rounds=15)
+    judge(
+        f"attention, rate / plain forward, {name}",
+        times["plain"] / times["score"],
+        at_least=0.5,
+    )
+    benchmark.extra_info["states_per_s"] = rows / times["score"]
+    benchmark.pedantic(score, rounds=3)

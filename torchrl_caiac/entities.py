@@ -221,6 +221,7 @@ class EntityLayout:
             None if achieved_goal_key is None else _key(achieved_goal_key)
         )
         self._tensors: dict[Any, torch.Tensor] = {}
+        self._next_keys: dict[NestedKey, NestedKey] = {}
 
     def _check_known(self, names: Iterable[str], what: str) -> None:
         unknown = [name for name in names if name not in self.names]
@@ -527,7 +528,10 @@ class EntityLayout:
             >>> EntityLayout({"arm": [0]}).next("observation")
             ('next', 'observation')
         """
-        return _key((*_path(self.next_key), *_path(key)))
+        # Kept: a key is put together in the time of two small tensor operations.
+        if key not in self._next_keys:
+            self._next_keys[key] = _key((*_path(self.next_key), *_path(key)))
+        return self._next_keys[key]
 
     def _check_width(self, width: int, key: NestedKey | None = None) -> None:
         needed = 1 + max(max(columns) for columns in self.columns.values())
@@ -572,12 +576,18 @@ class EntityLayout:
         return value
 
     def _index_tensor(
-        self, what: str, columns: Sequence[int], device: torch.device
+        self,
+        what: Any,
+        columns: Sequence[int],
+        device: torch.device,
+        dtype: torch.dtype = torch.int64,
     ) -> torch.Tensor:
         # Kept per device: an index on the host would synchronise a GPU every time.
-        if (what, device) not in self._tensors:
-            self._tensors[what, device] = torch.tensor(columns, device=device)
-        return self._tensors[what, device]
+        known = self._tensors.get((what, device))
+        if known is None or known.dtype != dtype:
+            known = torch.tensor(columns, device=device, dtype=dtype)
+            self._tensors[what, device] = known
+        return known
 
     # --- saving ------------------------------------------------------------------
 

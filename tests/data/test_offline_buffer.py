@@ -67,3 +67,19 @@ def test_bad_data():
         offline_buffer(rows()[:0])
     with pytest.raises(ValueError, match=r"batch size \[3, 4\]"):
         offline_buffer(rows().reshape(3, 4))
+
+
+def test_rows_are_drawn_on_the_host():
+    assert offline_buffer(rows(), 6).storage.device == torch.device("cpu")
+
+
+@pytest.mark.gpu
+def test_rows_are_drawn_where_the_data_lie():
+    data = TensorDict(rows().to("cuda").to_dict(), [12])  # which names no device
+    rb = offline_buffer(data, 6)
+    rb.sample()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        assert rb.sample()["observation"].is_cuda
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

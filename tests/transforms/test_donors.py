@@ -11,9 +11,12 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorStorage
 
+from torchrl_caiac import EntityLayout
 from torchrl_caiac.transforms import donors as module
 from torchrl_caiac.transforms.donors import (
     TrajectoryIndex,
+    _Leaf,
+    _window_index,
     call_reward,
     draw_batch_donors,
     draw_buffer_donors,
@@ -67,6 +70,21 @@ def test_trajectory_index(case, ids: bool) -> None:
         ):
             left += 1
         assert int(index.remaining(torch.tensor([row]))) == left
+    rows = torch.arange(len(order))
+    searched = index._replace(left=None).remaining(rows)
+    assert torch.equal(index.remaining(rows), searched)
+
+
+@pytest.mark.parametrize(("length", "dtype"), [(9, "int32"), (1 << 30, "int64")])
+def test_places_in_long_storages(length: int, dtype: str) -> None:
+    layout = EntityLayout({"arm": [0], "cup": [1]})
+    leaf = _Leaf("observation", torch.zeros(4, 2), torch.tensor([0, 1]))
+    rows = torch.tensor([[length - 2, 3, 0]])
+    index = _window_index(layout, rows, leaf, 2, length, None)
+    assert str(index.dtype) == f"torch.{dtype}"
+    assert index.tolist() == [2 * length - 4, 7, 2 * length - 2, 9]
+    ring = _window_index(layout, rows, leaf, 2, length, length - 1)
+    assert ring.tolist() == [2 * length - 4, 7, 0, 9]
 
 
 @settings(deadline=None)

@@ -23,8 +23,8 @@ def offline_buffer(
     ``data``: to its folder, when it is memory-mapped.
 
     Args:
-        data (TensorDictBase): the rows, ``[T]``, in memory or memory-mapped (from
-            :func:`load_transitions` or :func:`load_minari`).
+        data (TensorDictBase): the rows, ``[T]``, in memory, memory-mapped (from
+            :func:`load_transitions` or :func:`load_minari`), or on a GPU.
         batch_size (int, optional): rows per sample.
         sampler (Sampler, optional): the sampler. Defaults to uniform sampling.
         kwargs: more arguments of ``TensorDictReplayBuffer``.
@@ -50,8 +50,10 @@ def offline_buffer(
             f"data has the batch size {list(data.batch_size)}, wanted [T] with at "
             "least one row: flatten trajectories, and tell them apart by an id"
         )
+    # Where the rows are drawn: rows of a GPU from the host would have to be sent there.
+    device = data.device or next(iter(data.values(True, True))).device
     arguments: dict[str, Any] = {
-        "storage": TensorStorage(data, device=data.device or "cpu"),
+        "storage": TensorStorage(data, device=device),
         "writer": ImmutableDatasetWriter(),
         "batch_size": batch_size,
         **kwargs,

@@ -85,8 +85,8 @@ class CAIACTransform(CounterfactualTransform):
         done_key (NestedKey): end flags, read where there are no ids. Defaults to
             ``("next", "done")``.
         check (bool): check the values of each batch: scores, windows, observations.
-            It costs one synchronisation on an accelerator, little else. Defaults to
-            ``True``.
+            On a CUDA device nothing waits for the result, so that an error comes with
+            a later sample and names no rows. Defaults to ``True``.
 
     Raises:
         TypeError: an argument has the wrong type.

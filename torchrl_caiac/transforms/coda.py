@@ -74,8 +74,8 @@ class CoDATransform(CounterfactualTransform):
             trajectories and to find donor windows. Defaults to ``"episode"``.
         done_key (NestedKey): end flags, read where there are no ids. Defaults to
             ``("next", "done")``.
-        check (bool): check the values of each batch: graphs, windows, observations.
-            Defaults to ``True``.
+        check (bool): check the values of each batch: graphs, windows, observations;
+            on a CUDA device an error comes with a later sample. Defaults to ``True``.
 
     Raises:
         TypeError: an argument has the wrong type.

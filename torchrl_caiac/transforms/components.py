@@ -17,8 +17,10 @@ from torchrl_caiac.transforms.donors import (
     BufferDonors,
     SwapDraw,
     TrajectoryIndex,
+    _pick,
     _rand,
     _scan,
+    _window_max,
 )
 
 __all__ = [
@@ -142,9 +144,7 @@ def components(
         >>> components(graph, 0.2)
         tensor([[0, 6, 6, 8]])
     """
-    if window > 1:
-        graphs = graphs.unflatten(0, (-1, window)).amax(1)
-    links, held = _links(graphs, threshold)
+    links, held = _links(_window_max(graphs, window), threshold)
     if fixed is not None:
         held = held | _packed(fixed.to(held.device))
     return _joined(links, held)
@@ -209,16 +209,16 @@ def draw_batch_components(
     leader, pick, wanted = _shared(tail, swap_prob, generator)
     # The windows of each component lie together, each once: under its leader.
     keys, order = torch.where(_leads(masks), masks, 0).flatten().sort(stable=True)
-    place = torch.empty_like(order)
-    place[order] = torch.arange(len(order), device=masks.device)
+    places = torch.arange(order.shape[0], device=masks.device)
+    place = torch.empty_like(order).scatter_(0, order, places)
     begin = torch.searchsorted(keys, tail)
     others = torch.searchsorted(keys, tail, right=True) - begin - 1
     chosen = begin + pick % others.clamp_min(1)
     # A window is among those of its own component: step over it.
     chosen += chosen >= place.view(windows, entities)[first:].gather(1, leader)
-    donors = order[chosen.clamp_max(len(order) - 1)] // entities
-    found = others > 0
-    return SwapDraw(donors * window, wanted & found, (wanted & ~found).sum(0))
+    donors = _pick(order, chosen.clamp_max(order.shape[0] - 1)) // entities
+    swapped = wanted & (others > 0)
+    return SwapDraw(donors * window, swapped, (wanted ^ swapped).sum(0))
 
 
 def draw_buffer_components(
@@ -257,10 +257,12 @@ def draw_buffer_components(
     _, pick, wanted = _shared(masks, swap_prob, generator)
     place = torch.searchsorted(index.masks, masks.to(home))
     place = place.clamp_max(index.masks.shape[0] - 1)
-    found = (index.masks[place] == masks.to(home)).to(device)
-    chosen = pick.to(home) % index.size[place].clamp_min(1) + index.offset[place]
-    donors = index.starts[chosen].to(device, torch.int64)
-    return SwapDraw(donors, wanted & found, (wanted & ~found).sum(0))
+    found = (_pick(index.masks, place) == masks.to(home)).to(device)
+    size, offset = _pick(index.size, place), _pick(index.offset, place)
+    chosen = pick.to(home) % size.clamp_min(1) + offset
+    donors = _pick(index.starts, chosen).to(device, torch.int64)
+    swapped = wanted & found
+    return SwapDraw(donors, swapped, (wanted ^ swapped).sum(0))
 
 
 # --- what may be drawn from a storage ------------------------------------------------

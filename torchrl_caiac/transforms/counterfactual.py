@@ -23,6 +23,7 @@ from torchrl_caiac.transforms.donors import (
     recompute_reward,
 )
 from torchrl_caiac.transforms.hindsight_goal import take_back
+from torchrl_caiac.transforms.late_check import LateCheck
 from torchrl_caiac.transforms.window_goal import WindowGoal
 
 __all__ = ["CounterfactualTransform"]
@@ -151,6 +152,7 @@ class CounterfactualTransform(Transform, ABC):
                 ),
             )
         self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
+        self._late = LateCheck()
 
     # --- what augmentations differ in ------------------------------------------------
 
@@ -271,22 +273,21 @@ class CounterfactualTransform(Transform, ABC):
             out = self._donors[0].apply(tensordict, draw)
         else:
             out = apply_swap(tensordict, self.layout, draw, window=self.window)
-        changed = draw.swapped.shape[0] * self.window
+        windows = draw.swapped.shape[0]
+        changed, total = windows * self.window, tensordict.shape[0]
         if self.reward_fn is not None and changed:
             reward = recompute_reward(
                 out, self.layout, self.reward_fn, changed, reward_key=self.reward_key
             )
             out.set(self.reward_key, reward)
-        total = tensordict.shape[0]
         swapped = draw.swapped
         if self.window > 1:
-            swapped = swapped.repeat_interleave(self.window, 0)
-        marks = swapped.new_zeros(total, swapped.shape[-1])
-        marks[total - changed :] = swapped
+            swapped = swapped.unsqueeze(1).expand(-1, self.window, -1).flatten(0, 1)
+        kept = swapped.new_zeros(total - changed, swapped.shape[-1])
         counterfactual = swapped.new_zeros(total, 1)
-        counterfactual[total - changed :] = True
+        counterfactual[total - changed :].fill_(True)
         out.set(self.counterfactual_key, counterfactual)
-        out.set(self.swapped_key, marks)
+        out.set(self.swapped_key, torch.cat([kept, swapped]))
         return out
 
     # --- the transform ---------------------------------------------------------------
@@ -375,17 +376,30 @@ class CounterfactualTransform(Transform, ABC):
     def _check(
         self, before: TensorDictBase, after: TensorDictBase, scores: torch.Tensor
     ) -> None:
-        """Raises where values make no sense, with one look at the device."""
-        # A sum is finite if all its terms are (unless it overflows: looked at below).
-        finite = [leaf.sum() for _, leaf in self._observed(after)]
-        finite.append(scores.sum())
-        total = torch.stack([value.float() for value in finite]).sum()
-        ok = torch.isfinite(total)
+        """Raises where values make no sense: on CUDA devices, with a later batch."""
+        observed = self._observed(after)
         crossing = self._crossing(before)
+        leaves = [scores, *(leaf for _, leaf in observed)]
+        # A sum is finite if all its terms are (unless it overflows: looked at below).
+        if not LateCheck.needed(scores.device):
+            finite = math.isfinite(sum(leaf.sum().item() for leaf in leaves))
+            if not finite or (crossing is not None and bool(crossing.any())):
+                self._explain(after, scores, crossing)
+            return
+        found = self._late.found()
+        if found:
+            self._explain(after, scores, crossing)  # it is likely wrong here too
+            names = [self.score_key, *(key for key, _ in observed), "the windows"]
+            raise ValueError(
+                f"{[names[place] for place in found]} made no sense in a batch that "
+                f"was sampled before this one: {self._what} or observations are NaN or "
+                "infinite, or windows cross a trajectory's end. On a CUDA device "
+                "errors come late; sample the same data on the CPU to learn the rows"
+            )
+        sums = [leaf.sum(dtype=torch.float64) for leaf in leaves]
         if crossing is not None:
-            ok = ok & ~crossing.any()
-        if not ok.item():
-            self._explain(after, scores, crossing)
+            sums.append(torch.where(crossing.any(), math.nan, 0.0).double())
+        self._late.add(torch.stack(sums))
 
     def _crossing(self, td: TensorDictBase) -> torch.Tensor | None:
         """Bool ``[B, window - 1]``: where a window goes over a trajectory's end."""

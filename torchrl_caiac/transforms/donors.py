@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
@@ -74,11 +75,14 @@ class TrajectoryIndex(NamedTuple):
         length (int): rows in the storage, ``T``.
         oldest (int): the oldest row, behind the write cursor of a full ring buffer.
         ends (torch.Tensor): int64 ``[E]``, ascending positions of last rows.
+        left (torch.Tensor, optional): integer ``[T]``, how many rows of the same
+            trajectory follow each row; saves searching for it.
     """
 
     length: int
     oldest: int
     ends: torch.Tensor
+    left: torch.Tensor | None = None
 
     def position(self, rows: torch.Tensor) -> torch.Tensor:
         """The positions of rows ``[*]``, int64 ``[*]``."""
@@ -90,8 +94,10 @@ class TrajectoryIndex(NamedTuple):
 
     def remaining(self, rows: torch.Tensor) -> torch.Tensor:
         """How many rows of the same trajectory follow each row, int64 ``[*]``."""
+        if self.left is not None:
+            return _pick(self.left, rows).long()
         position = self.position(rows)
-        return self.ends[torch.searchsorted(self.ends, position)] - position
+        return _pick(self.ends, torch.searchsorted(self.ends, position)) - position
 
 
 class DonorIndex(NamedTuple):
@@ -133,9 +139,15 @@ def uninfluenced(
         tensor([[ True],
                 [False]])
     """
-    if window > 1:
-        scores = scores.reshape(-1, window, scores.shape[-1]).amax(1)
-    return scores <= threshold
+    return _window_max(scores, window) <= threshold
+
+
+def _window_max(scores: torch.Tensor, window: int) -> torch.Tensor:
+    """The largest score of each window, ``[B, ...]``, NaN where one is NaN."""
+    if window == 1:
+        return scores
+    # Over the outermost dimension, which is several times as fast.
+    return scores.unflatten(0, (-1, window)).transpose(0, 1).contiguous().amax(0)
 
 
 def _rand(
@@ -144,9 +156,12 @@ def _rand(
     device: torch.device,
     generator: torch.Generator | None,
 ) -> torch.Tensor:
-    # A generator draws on its own device only.
+    # A generator draws on its own device only; from pinned memory, what it drew is
+    # copied without waiting for the accelerator.
     source = device if generator is None else generator.device
-    return kind(*args, generator=generator, device=source).to(device)
+    pinned = source.type == "cpu" and device.type == "cuda"
+    drawn = kind(*args, generator=generator, device=source, pin_memory=pinned)
+    return drawn.to(device, non_blocking=pinned)
 
 
 def _wanted(
@@ -192,24 +207,28 @@ def draw_batch_donors(
         >>> draw.donors, draw.swapped
         (tensor([[0, 1]]), tensor([[True, True]]))
     """
-    windows = free.shape[0]
-    tail = free[windows - num_counterfactual :]
-    wanted = _wanted(tail, swap_prob, generator)
-    # rank[b, n]: how many free windows entity n has up to and including window b.
-    rank = free.cumsum(0)
-    others = rank[-1] - 1
+    windows, entities = free.shape
+    first = windows - num_counterfactual
+    wanted = _wanted(free[first:], swap_prob, generator).t()
+    free = free.t()
+    # rank[n, b]: how many free windows entity n has up to and including window b.
+    rank = free.cumsum(1)
+    total, own = rank[:, -1:], rank[:, first:]
+    # At least two, of which a remainder can be taken: with fewer there is no donor.
+    size = total.clamp_min(2)
     pick = _rand(
-        torch.randint, _RANDOM_BITS, tail.shape, device=free.device, generator=generator
+        torch.randint, _RANDOM_BITS, own.shape, device=free.device, generator=generator
     )
-    pick = pick % others.clamp_min(1) + 1
-    # A free window is in its own entity's list: step over it.
-    pick = pick + (pick >= rank[windows - num_counterfactual :])
-    donors = torch.searchsorted(rank.t().contiguous(), pick.t().contiguous()).t()
-    found = others > 0
+    # Round the circle of free windows from the one behind the own, never back to it.
+    place = (pick % (size - 1) + own) % size
+    # listed[n, r]: the free window of rank r, from 1; those that are not free end up
+    # at 0.
+    starts = torch.arange(0, windows * window, window, device=free.device)
+    listed = rank.new_zeros(entities, windows + 2)
+    listed.scatter_(1, rank * free, starts.expand(entities, -1))
+    swapped = wanted & (total > 1)
     return SwapDraw(
-        donors.clamp_max(windows - 1) * window,
-        wanted & found,
-        (wanted & ~found).sum(0),
+        listed[:, 1:].gather(1, place).t(), swapped.t(), (wanted ^ swapped).sum(1)
     )
 
 
@@ -248,12 +267,13 @@ def draw_buffer_donors(
     pick = _rand(
         torch.randint, _RANDOM_BITS, free.shape, device=device, generator=generator
     )
-    pick = (pick % size.clamp_min(1) + index.offset.to(device)).clamp_max(
+    pick = (pick % size.clamp_min(1) + index.offset.to(device)).clamp_max_(
         index.starts.shape[0] - 1
     )
     found = size > 0
-    donors = index.starts[pick.to(index.starts.device)].to(device, torch.int64)
-    return SwapDraw(donors, wanted & found, (wanted & ~found).sum(0))
+    donors = _pick(index.starts, pick).to(device, torch.int64)
+    swapped = wanted & found
+    return SwapDraw(donors, swapped, (wanted ^ swapped).sum(0))
 
 
 # --- what may be drawn from a storage ------------------------------------------------
@@ -262,6 +282,12 @@ def draw_buffer_donors(
 def _plain(tensor: torch.Tensor) -> torch.Tensor:
     # Indexing a memory-mapped tensor as a plain one skips its Python dispatch.
     return tensor.as_subclass(torch.Tensor)
+
+
+def _pick(source: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+    """``source[rows]`` for rows of any shape, several times as fast."""
+    found = source.index_select(0, rows.to(source.device).reshape(-1))
+    return found.view(*rows.shape, *source.shape[1:])
 
 
 def _storage_td(storage: Any, what: str) -> TensorDictBase:
@@ -298,7 +324,7 @@ def trajectory_index(
 
     A trajectory ends where the id in ``trajectory_key`` changes; where the storage
     has no such leaf, at ``done_key``. The newest row, under the write cursor of a
-    ring buffer, is always an end.
+    ring buffer, is always an end. The index takes 4 bytes a row.
 
     Args:
         storage (TensorStorage): one-dimensional, ``[T]``.
@@ -342,7 +368,11 @@ def trajectory_index(
         leaf = leaf.roll(-oldest)
     last = torch.ones(length, dtype=torch.bool, device=leaf.device)
     last[:-1] = leaf[:-1].bool() if ids is None else leaf[1:] != leaf[:-1]
-    return TrajectoryIndex(length, oldest, last.nonzero()[:, 0])
+    ends = last.nonzero()[:, 0]
+    dtype = torch.int32 if length < 1 << 31 else torch.int64
+    left = ends.to(dtype).repeat_interleave(ends.diff(prepend=ends.new_tensor([-1])))
+    left -= torch.arange(length, dtype=dtype, device=left.device)
+    return TrajectoryIndex(length, oldest, ends, left.roll(oldest) if oldest else left)
 
 
 def _scan(
@@ -581,13 +611,15 @@ class BufferDonors:
 
     def apply(self, td: TensorDictBase, draw: SwapDraw) -> TensorDictBase:
         """Applies what :meth:`draw` returned, see :func:`apply_swap`."""
+        _, trajectories = self.index()
+        wraps = trajectories is not None and trajectories.oldest > 0
         return apply_swap(
             td,
             self.layout,
             draw,
             window=self.window,
             donors=self.data,
-            num_donor_rows=len(self.storage),
+            num_donor_rows=len(self.storage) if wraps else None,
             goals=self.goals,
         )
 
@@ -644,14 +676,14 @@ def goal_columns(layout: EntityLayout) -> list[int]:
 def _column_entity(
     layout: EntityLayout, what: str, width: int, device: torch.device
 ) -> torch.Tensor:
-    known = layout._tensors.get((f"swap {what} {width}", device))
+    known = layout._tensors.get(((what, width), device))
     if known is not None:
         return known
     owner = (
         layout.column_entity(width) if what == "state" else layout.goal_column_entity()
     )
     owner = torch.where(owner < 0, len(layout), owner)
-    return layout._index_tensor(f"swap {what} {width}", owner.tolist(), device)
+    return layout._index_tensor((what, width), owner.tolist(), device)
 
 
 def _leaves(td: TensorDictBase, layout: EntityLayout) -> list[_Leaf]:
@@ -686,6 +718,7 @@ def _leaves(td: TensorDictBase, layout: EntityLayout) -> list[_Leaf]:
             )
         owner = _column_entity(layout, "state", value.shape[-1], value.device)
         found.append(_Leaf(key, value, owner))
+    width = layout.goal_width
     for key, is_desired in (
         (layout.achieved_goal_key, False),
         (layout.next(layout.achieved_goal_key), False),
@@ -703,12 +736,12 @@ def _leaves(td: TensorDictBase, layout: EntityLayout) -> list[_Leaf]:
                 "the layout does not say whose columns these are: give "
                 "EntityLayout(..., goal=..., achieved=...)"
             )
-        if value.ndim != 2 or value.shape[-1] != layout.goal_width:
+        if value.ndim != 2 or value.shape[-1] != width:
             raise ValueError(
                 f"{key!r} has shape {list(value.shape)}, but the layout's goal has "
-                f"{layout.goal_width} columns: correct `goal`, or the data"
+                f"{width} columns: correct `goal`, or the data"
             )
-        owner = _column_entity(layout, "goal", layout.goal_width, value.device)
+        owner = _column_entity(layout, "goal", width, value.device)
         found.append(_Leaf(key, value, owner, is_desired))
     return found
 
@@ -825,39 +858,34 @@ def apply_swap(
     if not changed:
         return out
     first = td.shape[0] - changed * window
-    device = draw.swapped.device
-    own = torch.arange(first, td.shape[0], window, device=device).unsqueeze(-1)
-    # Where nothing is swapped, a row is its own donor; one more entity, which never
-    # swaps, owns the columns that no entity owns.
-    rows = torch.where(draw.swapped, draw.donors, own if donors is None else 0)
-    rows = torch.cat([rows, own if donors is None else torch.zeros_like(own)], -1)
-    swapped = torch.cat([draw.swapped, draw.swapped.new_zeros(changed, 1)], -1)
-    # Leaves of the same columns share their index.
+    own = torch.arange(first, td.shape[0], window, device=draw.swapped.device)
+    own = own.unsqueeze(-1) if donors is None else own.new_zeros(changed, 1)
+    # Where nothing is swapped, a row of the batch is its own donor; one more entity,
+    # which never swaps, owns the columns that no entity owns.
+    rows = torch.cat([torch.where(draw.swapped, draw.donors, own), own], -1)
+    # Leaves of the same columns share their index and mask.
     index: dict[int, torch.Tensor] = {}
+    masks: dict[tuple[int, int], torch.Tensor] = {}
     for leaf in leaves:
-        tail = leaf.value[first:]
-        drawn_goal = leaf.is_desired and goals is not None and donors is not None
-        if drawn_goal:
-            values = goals.donor_goals(  # type: ignore[union-attr]
+        known = id(leaf.entity)
+        if donors is not None and leaf.is_desired and goals is not None:
+            values = goals.donor_goals(
                 donors, draw.goal_rows, leaf.entity, leaf.key
             ).unsqueeze(1)
         else:
             source = leaf.value if donors is None else _donor_leaf(donors, leaf)
-            known = id(leaf.entity)
             if known not in index:
                 index[known] = _window_index(
-                    layout, rows, leaf, window, num_donor_rows
+                    layout, rows, leaf, window, len(source), num_donor_rows
                 ).to(source.device)
             values = _take(source, index[known], leaf.entity)
         if donors is not None:
-            values = values.to(tail.device, tail.dtype)
-            if isinstance(leaf.entity, int):
-                mask = swapped[:, leaf.entity].view(-1, *(1,) * tail.ndim)
-            else:
-                mask = swapped.index_select(1, leaf.entity).unsqueeze(1)
-            tail = tail.unflatten(0, (changed, window))
-            values = torch.where(mask, values, tail)
-        values = values.reshape(changed * window, *leaf.value.shape[1:])
+            kind = known, leaf.value.ndim
+            if kind not in masks:
+                masks[kind] = _swapped_values(draw.swapped, leaf)
+            tail = leaf.value[first:].unflatten(0, (changed, window))
+            values = values.to(tail.device).view(changed, -1, *tail.shape[2:])
+            values = torch.where(masks[kind], values, tail).flatten(0, 1)
         out.set(leaf.key, torch.cat([leaf.value[:first], values]))
     return out
 
@@ -867,38 +895,52 @@ def _window_index(
     rows: torch.Tensor,
     leaf: _Leaf,
     window: int,
+    length: int,
     num_rows: int | None,
 ) -> torch.Tensor:
-    """Where the values of each donor window lie in a leaf.
+    """Where the values of each donor window lie in a leaf of ``length`` rows.
 
-    Returns rows ``[C, window]`` for one entity's leaf; for columns, places
-    ``[C, window, D]`` in the leaf laid out as one vector.
+    Returns rows ``[C * window]`` for one entity's leaf; for columns, places
+    ``[C * window * D]`` in the leaf laid out as one vector.
     """
     if isinstance(leaf.entity, int):
-        place, stride = rows[:, leaf.entity], 1
+        shape: tuple[int, ...] = (window,)
+        stride, place = 1, rows[:, leaf.entity]
     else:
         stride = leaf.value.shape[-1]
-        columns = layout._index_tensor(
-            f"swap range {stride}", range(stride), rows.device
-        )
-        place = rows.index_select(1, leaf.entity.to(rows.device)) * stride + columns
-    place = place.unsqueeze(1)
-    if window > 1:
-        steps = torch.arange(0, window * stride, stride, device=rows.device)
-        place = place + (steps if place.ndim == 2 else steps.unsqueeze(-1))
+        shape = (window, stride)
+        place = rows.gather(1, leaf.entity.to(rows.device).expand(rows.shape[0], -1))
+    if length * stride < 1 << 31:  # half as much to write and to read
+        place = place.int()
+    inside = layout._index_tensor(
+        ("inside", *shape), range(window * stride), rows.device, place.dtype
+    )
+    place = torch.add(inside.view(shape), place.unsqueeze(1), alpha=stride).flatten()
     return place if num_rows is None else place % (num_rows * stride)
+
+
+def _swapped_values(swapped: torch.Tensor, leaf: _Leaf) -> torch.Tensor:
+    """Which values of a leaf are swapped, to broadcast with ``[C, window, ...]``."""
+    if isinstance(leaf.entity, int):
+        return swapped[:, leaf.entity].view(-1, *(1,) * leaf.value.ndim)
+    owner = leaf.entity.expand(swapped.shape[0], -1)
+    return F.pad(swapped, (0, 1)).gather(1, owner).unsqueeze(1)
 
 
 def _take(
     source: torch.Tensor, index: torch.Tensor, entity: int | torch.Tensor
 ) -> torch.Tensor:
-    """Reads what :func:`_window_index` points at, ``[C, window, ...]``."""
+    """Reads the rows, or the places of columns, that :func:`_window_index` returns.
+
+    Returns ``[C * window, ...]``.
+    """
     if isinstance(entity, int):
-        values = source.index_select(0, index.flatten())
-        return values.view(*index.shape, *source.shape[1:])
-    if not source.is_contiguous():  # flattening would copy all of it
-        return source.take(index)
-    return source.view(-1).index_select(0, index.flatten()).view(index.shape)
+        return source.index_select(0, index)
+    if source.is_contiguous():
+        found = source.view(-1).index_select(0, index)
+    else:  # flattening would copy all of it
+        found = source.take(index.long())
+    return found.view(-1, entity.shape[0])
 
 
 def _goal_vectors(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -16,8 +15,10 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_caiac.entities import EntityLayout, _path
 from torchrl_caiac.transforms.donors import (
+    _RANDOM_BITS,
     StorageCache,
     TrajectoryIndex,
+    _pick,
     _plain,
     _rand,
     _take,
@@ -63,35 +64,48 @@ def draw_goal_offset(
         tensor([4, 0])
     """
     weights = {name: weight for name, weight in mixture.items() if weight > 0}
-    shape, device = remaining.shape, remaining.device
+    device, offset = remaining.device, remaining
     chance = None
-    if set(weights) != {"last"}:
-        chance = _rand(
-            torch.rand, (2, *shape), device=device, generator=generator
-        ).double()
-    offset = remaining
+    if len(weights) > 1:
+        chance = _rand(torch.rand, remaining.shape, device=device, generator=generator)
     below, total = 0.0, sum(weights.values())
     for name, weight in weights.items():
-        if name == "last" or chance is None:
-            drawn = remaining
-        elif name == "uniform":
-            drawn = (chance[1] * (remaining + 1)).long()
-        else:
-            # Inverse of the distribution function, from u in [0, 1).
-            drawn = _geometric(chance[1], p)
-        drawn = torch.minimum(drawn, remaining)
+        drawn = remaining
+        if name == "uniform":
+            drawn = _rand(
+                torch.randint,
+                _RANDOM_BITS,
+                remaining.shape,
+                device=device,
+                generator=generator,
+            ) % (remaining + 1)
+        elif name == "geometric":
+            drawn = torch.minimum(
+                _geometric(remaining.shape, p, device, generator), remaining
+            )
         if chance is None or below == 0.0:
             offset = drawn
         else:
-            offset = torch.where(chance[0] >= below / total, drawn, offset)
+            offset = torch.where(chance >= below / total, drawn, offset)
         below += weight
     return offset
 
 
-def _geometric(u: torch.Tensor, p: float) -> torch.Tensor:
+def _geometric(
+    shape: torch.Size,
+    p: float,
+    device: torch.device,
+    generator: torch.Generator | None,
+) -> torch.Tensor:
+    """How many trials fail before one succeeds, int64."""
+
+    def draw(*, generator: Any, **kwargs: Any) -> torch.Tensor:
+        trials = torch.empty(shape, dtype=torch.int64, **kwargs)
+        return trials.geometric_(p, generator=generator) - 1
+
     if p >= 1.0:
-        return torch.zeros_like(u, dtype=torch.int64)
-    return (torch.log1p(-u) / math.log1p(-p)).long()
+        return torch.zeros(shape, dtype=torch.int64, device=device)
+    return _rand(draw, device=device, generator=generator)
 
 
 class FutureGoal(Transform, SampleUnit):
@@ -157,6 +171,12 @@ class FutureGoal(Transform, SampleUnit):
         self.done_key = unravel_key(done_key)
         self.counterfactual_key = unravel_key(counterfactual_key)
         self.generator = generator
+        if layout.is_flat and layout.achieved:
+            columns = goal_columns(layout)
+            self._goal_columns = (layout.next(layout.observation_key), columns)
+        elif layout.is_flat:
+            columns = list(range(layout.goal_width))
+            self._goal_columns = (layout.next(layout.achieved_goal_key), columns)
         self._reset_state()
 
     def _reset_state(self) -> None:
@@ -180,13 +200,7 @@ class FutureGoal(Transform, SampleUnit):
     # --- reading ---------------------------------------------------------------------
 
     def _flat_source(self, data: TensorDictBase) -> tuple[torch.Tensor, list[int]]:
-        layout = self.layout
-        if layout.achieved:
-            key: NestedKey = layout.next(layout.observation_key)
-            columns = goal_columns(layout)
-        else:
-            key = layout.next(layout.achieved_goal_key)
-            columns = list(range(layout.goal_width))
+        key, columns = self._goal_columns
         source = data.get(key, None)
         if source is None:
             raise KeyError(
@@ -232,10 +246,10 @@ class FutureGoal(Transform, SampleUnit):
             source, columns = self._flat_source(data)
             where = layout._index_tensor("goal", columns, source.device)
             if rows is None:
-                goals = source.index_select(-1, where)
+                goals = source.gather(1, where.expand(source.shape[0], -1))
             else:
                 places = rows.to(source.device).unsqueeze(-1) * source.shape[-1] + where
-                goals = _take(source, places, where)
+                goals = _take(source, places.flatten(), where)
             return {layout.desired_goal_key: goals}
         found: dict[NestedKey, torch.Tensor] = {}
         for name in layout.names:
@@ -249,7 +263,7 @@ class FutureGoal(Transform, SampleUnit):
             for below in sorted(map(_path, source.keys(True, True))):
                 found[(*_path(key), *below)] = _plain(source.get(below))
         if rows is not None:
-            found = {key: leaf[rows.to(leaf.device)] for key, leaf in found.items()}
+            found = {key: _pick(leaf, rows) for key, leaf in found.items()}
         return found
 
     # --- copying ---------------------------------------------------------------------

@@ -14,6 +14,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.donors import (
     RewardFn,
     _number,
+    _pick,
     _rand,
     _storage_td,
     call_reward,
@@ -236,6 +237,11 @@ class HindsightGoal(FutureGoal):
         Returns:
             HindsightDraw: the draw.
         """
+        if self.future > 0 and future is None:
+            raise ValueError(
+                f"future goals are wanted for a share of {self.future} of the real "
+                "rows, and none are given"
+            )
         generator = self.generator if generator is None else generator
         marks = counterfactual.reshape(-1)
         rows, device = marks.shape[0], marks.device
@@ -245,18 +251,16 @@ class HindsightGoal(FutureGoal):
         own = torch.arange(rows, device=device)
         # Real rows first: each kind draws among the places that it takes up.
         order = torch.argsort(marks.byte(), stable=True)
-        real = rows - marks.sum()
-        place = torch.where(marks, real + pick * (rows - real), pick * real).long()
-        share = torch.where(marks, self.counterfactual, self.future + self.random)
-        source = torch.where(chance < share, order[place] + rows, own)
+        marked = marks.sum()
+        real = rows - marked
+        place = (pick * torch.where(marks, marked, real)).long() + marks * real
+        goal = _pick(order, place) + rows
         if self.future > 0:
-            if future is None:
-                raise ValueError(
-                    f"future goals are wanted for a share of {self.future} of the real "
-                    "rows, and none are given"
-                )
-            later = (chance < self.future) & ~marks
-            source = torch.where(later, own + 2 * rows, source)
+            goal = torch.where(marks | (chance >= self.future), goal, own + 2 * rows)
+        wanted = torch.where(
+            marks, chance < self.counterfactual, chance < self.future + self.random
+        )
+        source = torch.where(wanted, goal, own)
         return HindsightDraw(source, future)
 
     # --- applying --------------------------------------------------------------------

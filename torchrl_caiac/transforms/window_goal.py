@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,8 +11,15 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.transforms.donors import TrajectoryIndex, _plain, _storage_td
+from torchrl_caiac.transforms.donors import (
+    TrajectoryIndex,
+    _pick,
+    _plain,
+    _storage_td,
+    _take,
+)
 from torchrl_caiac.transforms.future_goal import FutureGoal, _path, draw_goal_offset
+from torchrl_caiac.transforms.late_check import LateCheck
 
 __all__ = ["WindowGoal"]
 
@@ -124,6 +132,10 @@ class WindowGoal(FutureGoal):
         self.window = window
         self.mixture = dict(mixture)
 
+    def _reset_state(self) -> None:
+        super()._reset_state()
+        self._late = LateCheck()
+
     # --- drawing ---------------------------------------------------------------------
 
     def draw_rows(
@@ -168,7 +180,8 @@ class WindowGoal(FutureGoal):
             tuple: ``index`` and ``info``.
 
         Raises:
-            ValueError: the rows do not make up windows within trajectories.
+            ValueError: the rows do not make up windows within trajectories. On a CUDA
+                device this comes with a later sample, so that none is waited for.
         """
         rows = index[0] if isinstance(index, tuple) else index
         data = _storage_td(storage, "the buffer")
@@ -183,28 +196,42 @@ class WindowGoal(FutureGoal):
         trajectories = self._cache.get(storage)
         rows = rows.to(trajectories.ends.device)
         windows = rows.view(-1, self.window)
-        last = windows[:, -1]
-        remaining = trajectories.remaining(last)
+        first, last = windows[:, 0], windows[:, -1]
+        remaining = trajectories.remaining(first) - (self.window - 1)
         if self.window > 1:
-            position = trajectories.position(windows)
-            steps = torch.arange(self.window, device=rows.device)
-            # Consecutive, and the first row's trajectory does not end before.
-            broken = (position != position[:, :1] + steps).any() | (
-                trajectories.remaining(windows[:, 0]) != remaining + self.window - 1
-            ).any()
-            if broken.item():
-                raise ValueError(
-                    f"the sampler drew windows of {self.window} rows that are not "
-                    "consecutive rows of one trajectory: use SliceSampler with "
-                    f"slice_len={self.window} and strict_length=True, and trajectories "
-                    f"in {self.trajectory_key!r}"
-                )
+            self._check_windows(windows, remaining, trajectories)
+        # Below zero only where an error comes late.
         offset = draw_goal_offset(
-            remaining, self.mixture, p=self.p, generator=self.generator
+            remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
         )
         goal_rows = (last + offset) % trajectories.length
         self._pending.goals = self.read_goals(data, goal_rows)
         return index, info
+
+    def _check_windows(
+        self,
+        windows: torch.Tensor,
+        remaining: torch.Tensor,
+        trajectories: TrajectoryIndex,
+    ) -> None:
+        """Raises where rows are no windows: on an accelerator, some samples later."""
+        steps = torch.arange(self.window, device=windows.device)
+        follow = windows[:, :1] + steps
+        if trajectories.oldest:
+            follow %= trajectories.length
+        broken = (windows != follow).any() | (remaining < 0).any()
+        if LateCheck.needed(windows.device):
+            found = bool(self._late.found())
+            self._late.add(torch.where(broken, math.nan, 0.0).unsqueeze(0))
+        else:
+            found = bool(broken)
+        if found:
+            raise ValueError(
+                f"the sampler drew windows of {self.window} rows that are not "
+                "consecutive rows of one trajectory: use SliceSampler with "
+                f"slice_len={self.window} and strict_length=True, and trajectories "
+                f"in {self.trajectory_key!r}"
+            )
 
     def donor_goals(
         self,
@@ -228,14 +255,16 @@ class WindowGoal(FutureGoal):
         if isinstance(entity, torch.Tensor):
             source, columns = self._flat_source(donors)
             where = self.layout._index_tensor("goal", columns, source.device)
-            return source[rows[:, entity].to(source.device), where]
+            rows = rows.gather(1, entity.to(rows.device).expand(rows.shape[0], -1))
+            places = rows.to(source.device) * source.shape[-1] + where
+            return _take(source, places.flatten(), where)
         name = self.layout.names[entity]
         base = self.layout.goal[name]
         source = self._nested_source(donors, name)
         below = _below(key, base, self.layout.next(base))
         if below:
             source = _plain(source.get(below))
-        return source[rows[:, entity].to(source.device)]
+        return _pick(source, rows[:, entity])
 
     # --- writing ---------------------------------------------------------------------
 
@@ -273,9 +302,10 @@ class WindowGoal(FutureGoal):
                     f"rows, but the batch has {out.shape[0]} rows: append WindowGoal "
                     "first, before transforms that change the batch size"
                 )
-            rows = goal.repeat_interleave(self.window, 0) if self.window > 1 else goal
-            if out.device is not None:
-                rows = rows.to(out.device)
+            rows = goal if out.device is None else goal.to(out.device)
+            if self.window > 1:
+                rows = rows.unsqueeze(1).expand(-1, self.window, *goal.shape[1:])
+                rows = rows.flatten(0, 1)
             out.set(key, rows)
             after = self.layout.next(key)
             if out.get(after, None) is not None:

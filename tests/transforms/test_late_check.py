@@ -1,0 +1,339 @@
+"""What is checked late, and that nothing on the way of a sample waits for a device."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer
+
+from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac.transforms import HindsightGoal, WindowGoal
+from torchrl_caiac.transforms.late_check import LateCheck
+
+FLAT = EntityLayout(
+    {"arm": [0], "cup": [1, 2], "box": [4]},  # column 3 is nobody's
+    goal={"cup": [2, 0], "box": [1]},
+    achieved={"cup": [1, 2], "box": [4]},
+    fixed=["arm"],
+)
+NESTED = EntityLayout.from_keys(
+    {"arm": ("s", "arm"), "cup": ("s", "cup"), "box": ("s", "box")},
+    goal={"cup": ("g", "cup"), "box": ("g", "box")},
+    achieved={"cup": ("s", "cup"), "box": ("s", "box")},
+    fixed=["arm"],
+)
+EPISODES, LENGTH, WINDOW = 6, 10, 4
+
+
+# --- what is remembered --------------------------------------------------------------
+
+numbers = st.sampled_from([0.0, 1.5, -3e38, 3e38, math.nan, math.inf, -math.inf])
+
+
+@given(
+    batches=st.lists(st.lists(numbers, min_size=3, max_size=3), max_size=6),
+    asked=st.sets(st.integers(0, 5)),
+)
+def test_finds_what_was_not_finite_since_it_was_asked(
+    batches: list[list[float]], asked: set[int]
+) -> None:
+    late, bad = LateCheck(), set()
+    for i, values in enumerate(batches):
+        late.add(torch.tensor(values))
+        bad |= {place for place, value in enumerate(values) if not math.isfinite(value)}
+        if i in asked:
+            assert late.found() == sorted(bad)
+            bad = set()
+    assert late.found() == sorted(bad)
+    assert late.found() == []
+
+
+def test_other_values_start_anew_and_copies_are_empty() -> None:
+    late = LateCheck()
+    late.add(torch.tensor([math.nan]))
+    assert pickle.loads(pickle.dumps(late)).found() == []
+    late.add(torch.zeros(2))
+    assert late.found() == []
+
+
+def test_only_accelerators_are_looked_at_late() -> None:
+    assert LateCheck.needed(torch.device("cuda", 1))
+    assert not LateCheck.needed(torch.device("cpu"))
+
+
+# --- buffers -------------------------------------------------------------------------
+
+
+class EqualWindows(RandomSampler):
+    """Draws windows where the storage lies; SliceSampler looks at lengths."""
+
+    def sample(self, storage: Any, batch_size: int) -> tuple[torch.Tensor, dict]:
+        device = storage.device
+        shape = (batch_size // WINDOW, 1)
+        episode = torch.randint(EPISODES, shape, device=device)
+        start = torch.randint(LENGTH - WINDOW + 1, shape, device=device)
+        steps = torch.arange(WINDOW, device=device)
+        return (episode * LENGTH + start + steps).flatten(), {}
+
+
+def rows(layout: EntityLayout) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    total = EPISODES * LENGTH
+    state = torch.rand(total, 5, generator=generator)
+    goal = torch.rand(total, 3, generator=generator)
+    td = TensorDict(
+        {
+            "action": torch.rand(total, 2, generator=generator),
+            "episode": torch.arange(total) // LENGTH,
+            "next": {"reward": -torch.ones(total, 1)},
+            ("caiac", "score"): torch.zeros(total, 3),
+            ("coda", "graph"): torch.zeros(total, 4, 3),
+        },
+        [total],
+    )
+    for where, now in (((), state), (("next",), state + 1)):
+        if layout.is_flat:
+            td[(*where, "observation")] = now
+            td[(*where, "achieved_goal")] = now[:, [2, 4, 1]]
+        else:
+            td[(*where, "s", "arm")] = now[:, :1]
+            td[(*where, "s", "cup", "x")] = now[:, 1:2]
+            td[(*where, "s", "cup", "y")] = now[:, 2]
+            td[(*where, "s", "box")] = now[:, 4:]
+    if layout.is_flat:
+        td["desired_goal"] = goal
+    else:
+        td["g", "cup", "x"], td["g", "cup", "y"] = goal[:, 2:], goal[:, 0]
+        td["g", "box"] = goal[:, 1:2]
+    return td
+
+
+def reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+    return -(achieved - desired).abs().sum(-1)
+
+
+def buffer(
+    layout: EntityLayout,
+    kind: type,
+    window: int,
+    donors: str,
+    goals: bool,
+    device: str = "cpu",
+    **kwargs: Any,
+) -> ReplayBuffer:
+    """A buffer that samples 6 windows, with an augmentation and perhaps goals."""
+    storage = LazyTensorStorage(EPISODES * LENGTH, device=device)
+    source = None
+    if goals:
+        source = (
+            HindsightGoal(layout, reward, random=0.2, strategy="uniform")
+            if window == 1
+            else WindowGoal(layout, WINDOW, {"last": 1, "uniform": 1, "geometric": 1})
+        )
+    rb = ReplayBuffer(
+        storage=storage,
+        sampler=EqualWindows() if window > 1 else None,
+        sample_unit=source,
+        batch_size=6 * window,
+    )
+    rb.extend(rows(layout).to(device))
+    augment = kind(
+        layout,
+        window=window,
+        donors=storage if donors == "buffer" else None,
+        goals=WindowGoal(layout, WINDOW) if donors == "buffer" and window > 1 else None,
+        swap_prob=0.9,
+        reward_fn=reward if window == 1 else None,
+        **kwargs,
+    )
+    order = [augment] if source is None else [augment, source]
+    for transform in order if window == 1 else order[::-1]:
+        rb.append_transform(transform)
+    return rb
+
+
+every_setting = [
+    pytest.mark.parametrize("layout", [FLAT, NESTED], ids=["flat", "nested"]),
+    pytest.mark.parametrize("kind", [CAIACTransform, CoDATransform]),
+    pytest.mark.parametrize("window", [1, WINDOW]),
+    pytest.mark.parametrize("donors", ["batch", "buffer"]),
+    pytest.mark.parametrize("goals", [False, True], ids=["", "goals"]),
+]
+
+
+def in_every_setting(test: Callable[..., None]) -> Callable[..., None]:
+    for mark in every_setting:
+        test = mark(test)
+    return test
+
+
+# --- on the CPU, as if it were an accelerator ----------------------------------------
+
+
+class Waits(TorchDispatchMode):
+    """Raises where a CUDA device would be waited for."""
+
+    looks = (
+        *("_local_scalar_dense", "equal", "nonzero", "masked_select", "bincount"),
+        *("_unique", "_unique2", "unique_dim", "unique_consecutive"),
+        *("repeat_interleave", "lift_fresh"),
+    )
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        name = func.overloadpacket.__name__
+        masks = name in ("index", "index_put", "index_put_") and any(
+            where is not None and where.dtype in (torch.bool, torch.uint8)
+            for where in args[1]
+        )
+        if masks or name in self.looks:
+            raise AssertionError(f"{name} waits for the device")
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda x: x.sum().item(),
+        lambda x: bool((x > 0).all()),
+        lambda x: x[x > 0],
+        lambda x: x.__setitem__(x > 0, 1.0),
+        lambda x: x.nonzero(),
+        lambda x: x.unique(),
+        lambda x: torch.equal(x, x + 1),
+        lambda x: x.repeat_interleave(x.long()),
+        lambda x: x + torch.tensor([1.0, 2.0, 3.0]),
+    ],
+)
+def test_waiting_is_noticed(look: Callable[[torch.Tensor], Any]) -> None:
+    with Waits(), pytest.raises(AssertionError, match="waits for the device"):
+        look(torch.arange(3.0))
+
+
+@pytest.fixture
+def late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has values on the CPU checked like those of an accelerator."""
+    monkeypatch.setattr(LateCheck, "needed", staticmethod(lambda device: True))
+
+
+@in_every_setting
+@pytest.mark.usefixtures("late")
+def test_no_sample_waits(
+    layout: EntityLayout, kind: type, window: int, donors: str, goals: bool
+) -> None:
+    rb = buffer(layout, kind, window, donors, goals)
+    rb.sample()  # builds what is built once
+    with Waits():
+        batches = [rb.sample() for _ in range(3)]
+    assert any(batch["caiac", "swapped"].any() for batch in batches)
+    assert len(batches[0]) == 6 * window
+
+
+@pytest.mark.usefixtures("late")
+@pytest.mark.parametrize("key", ["observation", ("next", "observation")])
+def test_a_late_error_names_the_leaf(key: Any) -> None:
+    transform = CAIACTransform(FLAT)
+    good = rows(FLAT)[:8]
+    bad = good.clone()
+    bad[key][5, 3] = math.inf
+    transform(good)
+    transform(bad)
+    with pytest.raises(ValueError, match=r"observation.* in a batch that was sampled"):
+        transform(good)
+    transform(good)  # what was told is over
+    transform(good)
+    transform(bad)
+    with pytest.raises(ValueError, match=r"observation.*first in row 5 of the batch"):
+        transform(bad)  # wrong as well, and so the rows are known
+
+
+@pytest.mark.usefixtures("late")
+def test_late_errors_of_scores_and_windows() -> None:
+    transform = CAIACTransform(FLAT)
+    unscored = rows(FLAT)[:8]
+    unscored["caiac", "score"][2] = math.nan
+    transform(unscored)
+    with pytest.raises(ValueError, match="not scored, in 1 of 8 rows"):
+        transform(unscored)
+    transform = CAIACTransform(FLAT, window=4)
+    transform(rows(FLAT)[8:16])
+    with pytest.raises(ValueError, match=r"\['the windows'\] made no sense"):
+        transform(rows(FLAT)[:8])
+
+
+@pytest.mark.usefixtures("late")
+def test_window_goals_tell_late_that_rows_are_no_windows() -> None:
+    rb = buffer(FLAT, CAIACTransform, WINDOW, "batch", goals=True)
+    goals = rb._transform[0]
+    for wrong in ([0, 1, 2, 4], [7, 8, 9, 10], [8, 9, 10, 11]):
+        goals.expand(torch.tensor(wrong), {}, rb.storage)
+        with pytest.raises(ValueError, match="not consecutive rows"):
+            goals.expand(torch.arange(4), {}, rb.storage)
+        goals.expand(torch.arange(4), {}, rb.storage)
+
+
+# --- on a GPU ------------------------------------------------------------------------
+
+
+@contextmanager
+def nothing_waits() -> Iterator[None]:
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.gpu
+@in_every_setting
+def test_no_sample_waits_on_the_gpu(
+    layout: EntityLayout, kind: type, window: int, donors: str, goals: bool
+) -> None:
+    rb = buffer(layout, kind, window, donors, goals, device="cuda")
+    for _ in range(2):
+        rb.sample()  # builds what is built once
+    with nothing_waits():
+        batches = [rb.sample() for _ in range(3)]
+    assert any(batch["caiac", "swapped"].any() for batch in batches)
+    leaves = batches[0].values(include_nested=True, leaves_only=True)
+    assert all(leaf.is_cuda for leaf in leaves)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("window", [1, WINDOW])
+def test_a_generator_of_the_host_serves_a_gpu(window: int) -> None:
+    batches = []
+    for _ in range(2):
+        generator = torch.Generator().manual_seed(3)
+        augment = CAIACTransform(FLAT, window=window, generator=generator)
+        td = rows(FLAT)[: 5 * WINDOW].to("cuda")
+        augment(td)
+        with nothing_waits():
+            batches.append(augment(td))
+    assert (batches[0] == batches[1]).all()
+
+
+@pytest.mark.gpu
+def test_errors_come_late_on_the_gpu() -> None:
+    transform = CAIACTransform(FLAT)
+    good = rows(FLAT)[:8].to("cuda")
+    bad = good.clone()
+    bad["observation"][5, 3] = math.nan
+    transform(good)
+    with nothing_waits():
+        transform(bad)
+    torch.cuda.synchronize()
+    with pytest.raises(ValueError, match=r"observation.* in a batch that was sampled"):
+        transform(good)
+    transform(good)
