@@ -1,9 +1,14 @@
 """Milliseconds of an LMP gradient step, and the share of sampling and swapping.
 
 Run with ``pytest benchmarks/bench_lmp.py`` (``make bench``). The data have the
-kitchen's shapes: 100 demonstrations of 60 steps, 30 state columns, 9 entities of
+kitchen's shapes: 100 demonstrations of 60 steps, 30 state columns, 10 entities of
 which the robot is never swapped, 21 goal columns. ``extra_info`` of the last
-benchmark holds the share of the step that goes to ``rb.sample()``.
+benchmark holds the share of the step that goes to ``rb.sample()``. With
+``--device=cuda`` the storage lies on the device, too.
+
+The step is judged beside a bare one: the same modules called on plain tensors, the
+squared error and the KL divergence written out, no tensordict, no checks. Both end
+with the backward pass; the optimizer, alike on both sides, is left out.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 
+from benchmarks.ratios import seconds
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.lmp import LMPModel
 from torchrl_caiac.objectives.lmp import LMPLoss
@@ -48,8 +54,10 @@ def kitchen_layout() -> EntityLayout:
     )
 
 
-def make_buffer(windows: int, window: int, *, swap: bool) -> ReplayBuffer:
-    """Scored demonstrations in memory, sampled in windows with goals."""
+def make_buffer(
+    windows: int, window: int, device: torch.device, *, swap: bool
+) -> ReplayBuffer:
+    """Scored demonstrations on a device, sampled in windows with goals."""
     layout = kitchen_layout()
     generator = torch.Generator().manual_seed(0)
     rows = TRAJECTORIES * STEPS
@@ -69,7 +77,7 @@ def make_buffer(windows: int, window: int, *, swap: bool) -> ReplayBuffer:
     )
     goals = WindowGoal(layout, window)
     rb = ReplayBuffer(
-        storage=LazyTensorStorage(rows),
+        storage=LazyTensorStorage(rows, device=device),
         sampler=SliceSampler(slice_len=window, traj_key="episode", cache_values=True),
         sample_unit=goals,
         batch_size=windows * window,
@@ -81,46 +89,104 @@ def make_buffer(windows: int, window: int, *, swap: bool) -> ReplayBuffer:
     return rb
 
 
-def make_step(window: int) -> Callable[[TensorDict], None]:
-    """One gradient step of the LMP on a batch of flat windows."""
+def make_loss(window: int, device: torch.device) -> LMPLoss:
+    """A new model and its loss."""
     torch.manual_seed(0)
-    model = LMPModel(D, G, A, window)
-    loss = LMPLoss(model, kl_weight=0.1)
-    optimizer = torch.optim.Adam(model.parameters(), lr=2e-3, fused=True)
+    return LMPLoss(LMPModel(D, G, A, window), kl_weight=0.1).to(device)
+
+
+def make_step(window: int, device: torch.device) -> Callable[[TensorDict], None]:
+    """One gradient step of the LMP on a batch of flat windows."""
+    loss = make_loss(window, device)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=2e-3, fused=True)
 
     def step(batch: TensorDict) -> None:
         losses = loss(batch.reshape(-1, window))
         optimizer.zero_grad()
         (losses["loss_reconstruction"] + losses["loss_kl"]).backward()
         optimizer.step()
+        wait(device)
 
     return step
 
 
+def wait(device: torch.device) -> None:
+    """Until the device has done what it was told."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def bare_pass(
+    model: LMPModel, observation: torch.Tensor, action: torch.Tensor, goal: torch.Tensor
+) -> None:
+    """Forward and backward pass of the modules on tensors ``[*B, κ, *]``."""
+    loc_q, log_std_q = model.posterior.module(observation, action)
+    loc_p, log_std_p = model.prior.module(observation[:, 0], goal[:, 0])
+    plan = loc_q + log_std_q.exp() * torch.randn_like(loc_q)
+    error = (model.decoder.module(plan) - action).square().sum(-1).mean()
+    variance = (2 * log_std_q).exp() + (loc_q - loc_p).square()
+    ratio = variance / (2 * log_std_p).exp()
+    kl = (log_std_p - log_std_q + 0.5 * (ratio - 1)).sum(-1).mean()
+    (2 * error + 0.1 * kl).backward()
+
+
 @SIZES
-def test_gradient_step(benchmark, windows, window):
+def test_gradient_step(benchmark, device, windows, window):
     """The step alone, on a batch that is there."""
-    batch = make_buffer(windows, window, swap=True).sample()
-    benchmark.pedantic(make_step(window), args=(batch,), rounds=20, warmup_rounds=3)
+    batch = make_buffer(windows, window, device, swap=True).sample()
+    step = make_step(window, device)
+    benchmark.pedantic(step, args=(batch,), rounds=20, warmup_rounds=3)
+
+
+@SIZES
+def test_loss_beside_the_bare_modules(benchmark, judge, device, windows, window):
+    """Forward and backward pass, and the same without the loss around it."""
+    batch = make_buffer(windows, window, device, swap=True).sample()
+    loss, plain = make_loss(window, device), make_loss(window, device).model
+    leaves = [
+        batch[key].reshape(windows, window, -1)
+        for key in ("observation", "action", "desired_goal")
+    ]
+
+    def whole() -> None:
+        losses = loss(batch.reshape(-1, window))
+        (losses["loss_reconstruction"] + losses["loss_kl"]).backward()
+        loss.zero_grad()
+
+    def bare() -> None:
+        bare_pass(plain, *leaves)
+        plain.zero_grad()
+
+    times = seconds({"loss": whole, "bare": bare}, rounds=20)
+    name = f"LMP, {windows} windows of {window}, loss / bare modules"
+    judge(name, times["loss"] / times["bare"], at_most=1.3)
+    benchmark.pedantic(whole, rounds=5)
 
 
 @SIZES
 @pytest.mark.parametrize("swap", [False, True], ids=["plain", "swap"])
-def test_sample(benchmark, windows, window, swap):
+def test_sample(benchmark, device, windows, window, swap):
     """``rb.sample()`` with window goals, without and with counterfactuals."""
-    rb = make_buffer(windows, window, swap=swap)
-    benchmark.pedantic(rb.sample, rounds=40, warmup_rounds=3)
+    rb = make_buffer(windows, window, device, swap=swap)
+
+    def sample() -> None:
+        rb.sample()
+        wait(device)
+
+    benchmark.pedantic(sample, rounds=40, warmup_rounds=3)
 
 
 @SIZES
-def test_gradient_step_with_sampling(benchmark, windows, window):
+def test_gradient_step_with_sampling(benchmark, device, windows, window):
     """Sampling, swapping and the step, with the share of the first two."""
-    rb, step = make_buffer(windows, window, swap=True), make_step(window)
+    rb = make_buffer(windows, window, device, swap=True)
+    step = make_step(window, device)
     spent = []
 
     def run() -> None:
         start = time.perf_counter()
         batch = rb.sample()
+        wait(device)
         middle = time.perf_counter()
         step(batch)
         spent.append((middle - start, time.perf_counter() - middle))

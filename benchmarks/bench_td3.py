@@ -2,7 +2,7 @@
 
 Run with ``pytest benchmarks/bench_td3.py`` (``make bench``). The shapes are those of
 Fetch-Push with two cubes: 34 state columns, 6 of the goal and 12 relative features, 4
-actions, networks of 3 x 256, two critics. A round of ``test_step`` is two critic
+actions, networks of 3 x 256, two critics. A round of ``bench_step`` is two critic
 updates, one update of the policy and of the targets (policy delay 2), so ``extra_info``
 holds ``ms_per_step``, half of the fastest round.
 """
@@ -26,6 +26,12 @@ from torchrl_caiac.modules import (
 from torchrl_caiac.objectives import GoalConditionedTD3Loss
 
 D, G, A = 34, 6, 4
+LAYOUT = EntityLayout(
+    {"gripper": range(10), "cube0": range(10, 22), "cube1": range(22, 34)},
+    goal={"cube0": range(3), "cube1": range(3, 6)},
+    achieved={"cube0": range(10, 13), "cube1": range(22, 25)},
+    fixed=("gripper",),
+)
 BATCH = pytest.mark.parametrize("batch_size", [256, 512])
 DTYPE = pytest.mark.parametrize(
     "dtype", [None, torch.bfloat16], ids=["float32", "bfloat16"]
@@ -64,22 +70,14 @@ class Learner:
         dtype: torch.dtype | None,
         device: torch.device,
         *,
-        loop: bool = False,
         compiled: bool = False,
     ) -> None:
         torch.manual_seed(0)
-        layout = EntityLayout(
-            {"gripper": range(10), "cube0": range(10, 22), "cube1": range(22, 34)},
-            goal={"cube0": range(3), "cube1": range(3, 6)},
-            achieved={"cube0": range(10, 13), "cube1": range(22, 25)},
-            fixed=("gripper",),
-        )
-        features = GoalFeatures(layout, reference="gripper")
+        features = GoalFeatures(LAYOUT, reference="gripper")
         features.fit_statistics(make_batch(4096, torch.device("cpu")))
         self.loss = GoalConditionedTD3Loss(
             GoalConditionedActor(features, A, hidden_dtype=dtype),
             [GoalConditionedCritic(features, A, hidden_dtype=dtype) for _ in range(2)],
-            deactivate_vmap=loop,
         ).to(device)
         self.loss.make_value_estimator(gamma=0.97)
         self.updater = SoftUpdate(self.loss, tau=0.005)
@@ -121,10 +119,9 @@ def measure(benchmark, function: Callable[[TensorDict], None], batch: TensorDict
 
 @BATCH
 @DTYPE
-@pytest.mark.parametrize("critics", ["vmap", "loop"])
-def bench_step(benchmark, device, batch_size, dtype, critics):
-    """Whole updates; ``loop`` is the loss's ``deactivate_vmap=True``."""
-    learner = Learner(dtype, device, loop=critics == "loop")
+def bench_step(benchmark, device, batch_size, dtype):
+    """Whole updates."""
+    learner = Learner(dtype, device)
     measure(benchmark, learner.two_steps, make_batch(batch_size, device))
     if benchmark.stats is not None:
         fastest = benchmark.stats.stats.min

@@ -131,7 +131,6 @@ def make_loss(cfg: DictConfig, actor: GoalConditionedActor) -> GoalConditionedTD
         ],
         policy_noise=settings.policy_noise,
         noise_clip=settings.noise_clip,
-        deactivate_vmap=True,  # quicker on a CPU
     )
     loss_module.make_value_estimator(gamma=settings.gamma)
     return loss_module

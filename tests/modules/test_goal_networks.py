@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -12,6 +14,8 @@ from torchrl_caiac.modules import (
     GoalConditionedCritic,
     GoalFeatures,
 )
+from torchrl_caiac.modules import goal_networks as networks_module
+from torchrl_caiac.modules.goal_networks import takes_params
 
 LAYOUT = EntityLayout(
     {"arm": [0, 1], "cup": [2, 3]},
@@ -90,6 +94,43 @@ def test_reduced_precision_keeps_the_weights():
         for p, q in zip(a.parameters(), b.parameters(), strict=True):
             assert q.dtype == q.grad.dtype == torch.float32
             assert (p.grad - q.grad).norm() < 0.05 * p.grad.norm()
+
+
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16])
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_parameters_of_another(dtype, batch):
+    """Those of two networks, stacked, give the values of both."""
+    pairs = zip(networks(dtype), networks(dtype), strict=True)
+    for one, other in pairs:
+        torch.manual_seed(1)
+        with torch.no_grad():
+            for tensor in (*other.parameters(), *other.buffers()):
+                tensor.mul_(torch.rand_like(tensor) + 0.5)
+        key = one.out_keys[0]
+        want = [network(rows(*batch))[key] for network in (one, other)]
+        params = [TensorDict.from_module(x).data for x in (one, other)]
+        torch.testing.assert_close(one(rows(*batch), params[1])[key], want[1])
+        assert not torch.equal(*want)
+        if key == "action":
+            continue  # a loss has one policy
+        stacked = torch.stack(params)
+        got = one(rows(*batch).expand(2, *batch), stacked)[key]
+        torch.testing.assert_close(got, torch.stack(want))
+        with mock.patch.object(networks_module, "_on_cpu", return_value=False):
+            got = one(rows(*batch).expand(2, *batch), stacked)[key]
+        tolerance = {} if dtype is None else {"rtol": 0.02, "atol": 0.02}
+        torch.testing.assert_close(got, torch.stack(want), **tolerance)
+
+
+def test_who_takes_parameters():
+    class Other(GoalConditionedCritic):
+        def forward(self, tensordict):
+            return super().forward(tensordict)
+
+    actor, critic = networks()
+    assert takes_params(actor) and takes_params(critic)
+    assert not takes_params(Other(actor.features, 3, (4,)))
+    assert not takes_params(torch.nn.Linear(1, 1))
 
 
 def test_networks_keep_the_features_they_were_made_of():

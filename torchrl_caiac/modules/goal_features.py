@@ -166,13 +166,19 @@ class GoalFeatures(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], features)
 
     def forward_tensors(
-        self, observation: torch.Tensor, goal: torch.Tensor
+        self,
+        observation: torch.Tensor,
+        goal: torch.Tensor,
+        params: TensorDictBase | None = None,
     ) -> torch.Tensor:
         """The standardized features of tensors.
 
         Args:
             observation (torch.Tensor): ``[*B, D]``.
             goal (torch.Tensor): ``[*B, G]``.
+            params (TensorDictBase, optional): statistics to use instead of the
+                module's, such as those of ``C`` modules, stacked. ``*B`` begins with
+                ``C`` then.
 
         Returns:
             torch.Tensor: ``[*B, F]``, in the dtype of the statistics.
@@ -180,7 +186,14 @@ class GoalFeatures(TensorDictModuleBase):
         Raises:
             ValueError: a tensor has the wrong width.
         """
-        return self.standardize(self._join(observation, goal))
+        features = self._join(observation, goal)
+        if params is None:
+            return self.standardize(features)
+        mean, std = (params.get(("standardize", name)) for name in ("mean", "std"))
+        if mean.ndim > 1:
+            shape = (len(mean), *[1] * (features.ndim - 2), -1)
+            mean, std = mean.reshape(shape), std.reshape(shape)
+        return ((features - mean) / std).to(mean.dtype)
 
     def fit_statistics(self, tensordict: TensorDictBase) -> GoalFeatures:
         """Takes mean and deviation of every feature from data, in float64.

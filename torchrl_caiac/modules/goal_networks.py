@@ -6,7 +6,6 @@ import copy
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
@@ -14,6 +13,7 @@ from torch import nn
 from torchrl.modules import MLP
 
 from torchrl_caiac.modules.goal_features import GoalFeatures, read
+from torchrl_caiac.modules.linear import linear
 
 __all__ = ["GoalConditionedActor", "GoalConditionedCritic"]
 
@@ -31,16 +31,52 @@ class _CastLinear(nn.Linear):
         bias: bool = True,
         device: torch.device | None = None,
         compute_dtype: torch.dtype | None = None,
+        relu: bool = False,
     ) -> None:
         super().__init__(in_features, out_features, bias=bias, device=device)
         self.compute_dtype = compute_dtype
+        self.relu = relu
 
-    def forward(self, value: torch.Tensor) -> torch.Tensor:
-        dtype = self.compute_dtype or self.weight.dtype
-        return F.linear(value.to(dtype), self.weight.to(dtype), self.bias.to(dtype))
+    def forward(
+        self, value: torch.Tensor, params: TensorDictBase | None = None
+    ) -> torch.Tensor:
+        own = (self.weight, self.bias)
+        pair = own if params is None else (params.get("weight"), params.get("bias"))
+        dtype = self.compute_dtype or pair[0].dtype
+        value, weight, bias = (x.to(dtype) for x in (value, *pair))
+        if weight.ndim == 2:
+            return linear(value, weight, bias, self.relu)
+        rows = value.reshape(len(weight), -1, value.shape[-1])
+        out = torch.baddbmm(bias.unsqueeze(-2), rows, weight.mT)
+        out = out.reshape(*value.shape[:-1], -1)
+        return out.relu() if self.relu else out
 
     def extra_repr(self) -> str:
         return f"{super().extra_repr()}, compute_dtype={self.compute_dtype}"
+
+
+class _MLP(MLP):
+    """An MLP that can be called with parameters that are not its own.
+
+    Swapping them in and out of the modules would take a fifth of a training step.
+    Parameters of ``C`` networks, stacked, map ``[C, *B, I]`` to ``[C, *B, O]``.
+    """
+
+    def forward(
+        self, value: torch.Tensor, params: TensorDictBase | None = None
+    ) -> torch.Tensor:
+        if params is not None and params.batch_dims and _on_cpu(value):
+            # Which gains nothing by batched products, and has no quick ones in float32.
+            networks = zip(value, params.unbind(0), strict=True)
+            return torch.stack([self(one, own) for one, own in networks])
+        for name, layer in self.named_children():
+            if isinstance(layer, _CastLinear):
+                value = layer(value, None if params is None else params.get(name))
+        return value
+
+
+def _on_cpu(value: torch.Tensor) -> bool:
+    return value.device.type == "cpu"
 
 
 def _mlp(
@@ -48,7 +84,7 @@ def _mlp(
     out_features: int,
     hidden_sizes: Sequence[int],
     hidden_dtype: torch.dtype | None,
-) -> MLP:
+) -> _MLP:
     hidden_sizes = list(hidden_sizes)
     if not hidden_sizes or any(
         not isinstance(size, int) or size < 1 for size in hidden_sizes
@@ -59,15 +95,15 @@ def _mlp(
         )
     if hidden_dtype is not None and not hidden_dtype.is_floating_point:
         raise ValueError(f"hidden_dtype is a floating point dtype, got {hidden_dtype}")
-    # The last layer gives values and actions and keeps the dtype of the weights.
-    dtypes = [*[hidden_dtype] * len(hidden_sizes), None]
-    return MLP(
+    hidden = {"compute_dtype": hidden_dtype, "relu": True}
+    return _MLP(
         in_features,
         out_features,
         num_cells=hidden_sizes,
-        activation_class=nn.ReLU,
+        activation_class=nn.Identity,  # the layers do it themselves
         layer_class=_CastLinear,
-        layer_kwargs=[{"compute_dtype": dtype} for dtype in dtypes],
+        # The last layer gives values and actions and keeps the dtype of the weights.
+        layer_kwargs=[*[hidden] * len(hidden_sizes), {}],
     )
 
 
@@ -141,11 +177,15 @@ class GoalConditionedActor(TensorDictModuleBase):
         self.out_keys = [unravel_key(action_key)]
 
     @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(
+        self, tensordict: TensorDictBase, params: TensorDictBase | None = None
+    ) -> TensorDictBase:
         """Writes the action.
 
         Args:
             tensordict (TensorDictBase): states ``[*B, D]`` and goals ``[*B, G]``.
+            params (TensorDictBase, optional): parameters and buffers to use instead
+                of the module's own, such as those of a loss.
 
         Returns:
             TensorDictBase: the same, with the action ``[*B, A]`` set.
@@ -154,12 +194,15 @@ class GoalConditionedActor(TensorDictModuleBase):
             KeyError: an input is missing.
             ValueError: the state or the goal has the wrong width.
         """
-        value = self.network(
-            self.features.forward_tensors(*read(tensordict, self.in_keys))
+        observation, goal = read(tensordict, self.in_keys)
+        low, span, of_features, of_network = (
+            (self.low, self.span, None, None)
+            if params is None
+            else (params.get(key) for key in ("low", "span", "features", "network"))
         )
-        return tensordict.set(
-            self.out_keys[0], self.low + self.span * (0.5 * value.tanh() + 0.5)
-        )
+        features = self.features.forward_tensors(observation, goal, of_features)
+        value = self.network(features, of_network)
+        return tensordict.set(self.out_keys[0], low + span * (0.5 * value.tanh() + 0.5))
 
 
 class GoalConditionedCritic(TensorDictModuleBase):
@@ -222,12 +265,17 @@ class GoalConditionedCritic(TensorDictModuleBase):
         self.out_keys = [unravel_key(out_key)]
 
     @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(
+        self, tensordict: TensorDictBase, params: TensorDictBase | None = None
+    ) -> TensorDictBase:
         """Writes the value.
 
         Args:
             tensordict (TensorDictBase): states ``[*B, D]``, goals ``[*B, G]`` and
                 actions ``[*B, A]``.
+            params (TensorDictBase, optional): parameters and buffers to use instead
+                of the module's own, such as those that a loss has stacked of ``C``
+                critics. ``*B`` begins with ``C`` then.
 
         Returns:
             TensorDictBase: the same, with the value ``[*B, 1]`` set.
@@ -236,10 +284,34 @@ class GoalConditionedCritic(TensorDictModuleBase):
             KeyError: an input is missing.
             ValueError: the state or the goal has the wrong width.
         """
-        *state, action = read(tensordict, self.in_keys)
-        features = self.features.forward_tensors(*state)
-        value = self.network(features, action.to(features.dtype))
-        return tensordict.set(self.out_keys[0], value)
+        observation, goal, action = read(tensordict, self.in_keys)
+        of_features, of_network = (
+            None if params is None else params.get(name)
+            for name in ("features", "network")
+        )
+        features = self.features.forward_tensors(observation, goal, of_features)
+        inputs = torch.cat([features, action.to(features.dtype)], -1)
+        return tensordict.set(self.out_keys[0], self.network(inputs, of_network))
+
+
+def takes_params(network: nn.Module) -> bool:
+    """Whether a network can be called with parameters that are not its own.
+
+    Args:
+        network (nn.Module): a policy or an action value.
+
+    Returns:
+        bool: True for the networks of this file and False for those derived from them
+        with another ``forward``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.modules.goal_networks import takes_params
+        >>> takes_params(torch.nn.Linear(1, 1))
+        False
+    """
+    forward = type(network).forward
+    return forward in (GoalConditionedActor.forward, GoalConditionedCritic.forward)
 
 
 def _check_action_dim(action_dim: int) -> None:

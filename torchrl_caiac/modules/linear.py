@@ -1,0 +1,99 @@
+"""Linear layers by the quicker of two libraries on a CPU."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+__all__ = ["linear"]
+
+# Multiply-adds below which the larger overhead of a call outweighs the quicker kernel.
+_SMALL = 2**20
+
+
+def linear(value: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
+    """``value @ weight.T + bias``, and of that the positive part if wanted.
+
+    On CPUs torch leaves float32 products to MKL, which uses half the width of an AMD
+    processor's AVX-512 units. oneDNN, torch's library for bfloat16, uses all of it, in
+    the same precision: large float32 products go there.
+
+    Args:
+        value (torch.Tensor): ``[*B, I]``.
+        weight (torch.Tensor): ``[O, I]``.
+        bias (torch.Tensor): ``[O]``.
+        relu (bool): whether to take the positive part. Defaults to ``False``.
+
+    Returns:
+        torch.Tensor: ``[*B, O]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.modules.linear import linear
+        >>> linear(torch.ones(2, 2), -torch.ones(1, 2), torch.ones(1), relu=True)
+        tensor([[0.],
+                [0.]])
+    """
+    if value.numel() * len(weight) < _SMALL or not _onednn(value, weight, bias):
+        out = F.linear(value, weight, bias)
+        return out.relu_() if relu else out
+    rows = value.reshape(-1, value.shape[-1])
+    out = _Linear.apply(rows, weight, bias, relu)
+    return out.reshape(*value.shape[:-1], len(weight))
+
+
+def _onednn(*operands: Tensor) -> bool:
+    """Whether oneDNN is there, and has a kernel that MKL may lack."""
+    return (
+        all(x.device.type == "cpu" and x.dtype == torch.float32 for x in operands)
+        and torch.backends.mkldnn.is_available()
+        and torch.backends.cpu.get_cpu_capability() == "AVX512"
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.compiler.is_compiling()  # inductor chooses its own kernels
+    )
+
+
+class _Linear(torch.autograd.Function):
+    """oneDNN's product of rows ``[B, I]``, with gradients and :func:`torch.vmap`."""
+
+    @staticmethod
+    def forward(
+        value: Tensor, weight: Tensor, bias: Tensor | None, relu: bool
+    ) -> Tensor:
+        # What torch.compile makes of F.linear; torch has no public name for it.
+        product = torch.ops.mkldnn._linear_pointwise
+        after = "relu" if relu else "none"
+        out: Tensor = product(value, weight, bias, after, [], "")
+        return out
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        value, weight, _, relu = inputs
+        ctx.save_for_backward(value, weight, output if relu else None)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        value, weight, positive = ctx.saved_tensors
+        if positive is not None:
+            grad = torch.ops.aten.threshold_backward(grad, positive, 0)
+        needed = ctx.needs_input_grad
+        return (
+            _Linear.apply(grad, weight.t(), None, False) if needed[0] else None,
+            _Linear.apply(grad.t(), value.t(), None, False) if needed[1] else None,
+            grad.sum(0) if needed[2] else None,
+            None,
+        )
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], *operands: Any
+    ) -> tuple[Tensor, int]:
+        parts = [
+            [x] * info.batch_size if dim is None else x.unbind(dim)
+            for x, dim in zip(operands, in_dims, strict=True)
+        ]
+        layers = zip(*parts, strict=True)
+        return torch.stack([_Linear.apply(*layer) for layer in layers]), 0
