@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from unittest import mock
 
 import pytest
@@ -94,6 +95,26 @@ def test_reduced_precision_keeps_the_weights():
         for p, q in zip(a.parameters(), b.parameters(), strict=True):
             assert q.dtype == q.grad.dtype == torch.float32
             assert (p.grad - q.grad).norm() < 0.05 * p.grad.norm()
+
+
+@pytest.mark.parametrize("units", [True, False])
+def test_a_processor_without_bfloat16_units_is_told_of(monkeypatch, units):
+    known = {"avx512_f": True, "avx512_bf16": units, "cpu_name": "Some CPU"}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known)
+    networks_module._warn_without_bfloat16.cache_clear()
+    (actor, _), (plain, _) = networks(torch.bfloat16), networks()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        plain(rows(5))
+        assert not caught
+        first, again = (actor(rows(5))["action"] for _ in range(2))
+    networks_module._warn_without_bfloat16.cache_clear()
+    assert torch.equal(first, again)
+    assert [str(w.message)[:30] for w in caught] == [
+        "hidden layers in bfloat16 are "
+    ] * (not units)
+    if caught:
+        assert "Some CPU" in str(caught[0].message)
 
 
 @pytest.mark.parametrize("dtype", [None, torch.bfloat16])

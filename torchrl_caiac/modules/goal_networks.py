@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Sequence
+from functools import cache
 
 import torch
 from tensordict import TensorDictBase
@@ -43,6 +45,8 @@ class _CastLinear(nn.Linear):
         own = (self.weight, self.bias)
         pair = own if params is None else (params.get("weight"), params.get("bias"))
         dtype = self.compute_dtype or pair[0].dtype
+        if dtype is torch.bfloat16 and _on_cpu(value):
+            _warn_without_bfloat16()
         value, weight, bias = (x.to(dtype) for x in (value, *pair))
         if weight.ndim == 2:
             return linear(value, weight, bias, self.relu)
@@ -77,6 +81,20 @@ class _MLP(MLP):
 
 def _on_cpu(value: torch.Tensor) -> bool:
     return value.device.type == "cpu"
+
+
+@cache
+def _warn_without_bfloat16() -> None:
+    """Says once that this processor has no units for what was asked of it."""
+    capabilities = torch.cpu.get_capabilities()
+    if not any(known for name, known in capabilities.items() if "bf16" in name):
+        warnings.warn(
+            "hidden layers in bfloat16 are slower than in float32 here: this processor "
+            f"({capabilities.get('cpu_name', 'unknown')}) has no bfloat16 units, and "
+            "torch emulates them. Use hidden_dtype=None",
+            RuntimeWarning,
+            stacklevel=2,
+        )
 
 
 def _mlp(
