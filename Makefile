@@ -70,7 +70,8 @@ influence: setup ## compare influence estimators (QUICK=1: a smoke run)
 bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --benchmark-only \
-	    --device=$(DEVICE) --benchmark-json=benchmark-$(DEVICE).json
+	    --device=$(DEVICE) --benchmark-json=benchmark-$(DEVICE).json \
+	    --ratios=benchmark-$(DEVICE).txt
 
 docs: setup ## build the documentation, warnings are errors
 	rm -rf docs/reference/generated
@@ -80,5 +81,5 @@ docs: setup ## build the documentation, warnings are errors
 clean: ## remove what was built and cached; .venv and outputs stay
 	rm -rf build dist *.egg-info docs/_build docs/auto_tutorials \
 	    docs/reference/generated docs/sg_execution_times.rst \
-	    .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache benchmark-*.json
+	    .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache benchmark-*
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,10 +15,11 @@ _JUDGED = pytest.StashKey[list[Judged]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds ``--device``, which ``make bench DEVICE=...`` sets."""
+    """Adds ``--device`` and ``--ratios``, which ``make bench DEVICE=...`` sets."""
     parser.addoption(
         "--device", default="cpu", choices=["cpu", "cuda"], help="where to measure"
     )
+    parser.addoption("--ratios", help="a file that the list of ratios is written to")
 
 
 @pytest.fixture(scope="session")
@@ -70,8 +72,10 @@ def judge(benchmark: Any, request: pytest.FixtureRequest) -> Callable[..., None]
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     """Lists the ratios, their targets, and whether they hold."""
-    judged = config.stash.get(_JUDGED, [])
-    if judged:
+    lines = [str(one) for one in config.stash.get(_JUDGED, [])]
+    if lines:
         terminalreporter.section("ratios and their targets")
-        for one in judged:
-            terminalreporter.write_line(str(one))
+        for line in lines:
+            terminalreporter.write_line(line)
+    if config.getoption("--ratios"):
+        Path(config.getoption("--ratios")).write_text("\n".join(lines) + "\n")
