@@ -110,7 +110,11 @@ def compare(cfg: DictConfig) -> list[dict[str, Any]]:
         held_out, Path(cfg.out) / "held_out_truth.pt", cfg, cfg.score.truth_actions
     )
     rows = compare_influence(with_readings(held_out), truth, candidates(cfg))
-    publish_comparison(cfg.demo.influence, rows, experiment=cfg.name)
+    publish_comparison(
+        cfg.demo.influence,
+        rows,
+        experiment="kitchen_all_tasks" if cfg.collect.chains else "kitchen",
+    )
     return rows
 
 

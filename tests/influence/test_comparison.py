@@ -175,6 +175,12 @@ def test_experiments_share_the_published_table(tmp_path):
         found = [(r["experiment"], r["entity"]) for r in csv.DictReader(file)]
     assert found == list(product(("push", "kitchen"), ("all", "cup", "box")))
     assert (tmp_path / "influence.png").stat().st_size > 1000
+    lines = (tmp_path / "influence.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines if line.strip()] == [
+        *("push", "θ", "row"),
+        *("kitchen", "θ", "row"),
+    ]
+    assert lines[2].split()[1:3] == ["0.5", "1"]  # θ and the AUC
     (tmp_path / "influence.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match=r"columns \['a', 'b'\]"):
         publish_comparison(tmp_path, table, experiment="push")

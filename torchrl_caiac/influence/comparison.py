@@ -265,7 +265,8 @@ def publish_comparison(
 ) -> None:
     """Writes a comparison to ``influence.csv``, and draws ``influence.png``.
 
-    Several experiments share the files: each call replaces the rows of its own.
+    ``influence.txt`` has the rows over all entities, to be read. Several experiments
+    share the files: each call replaces the rows of its own.
 
     Args:
         folder (str or Path): where the files are.
@@ -279,8 +280,41 @@ def publish_comparison(
     table = update_csv(
         Path(folder) / "influence.csv", rows, COLUMNS, experiment=experiment
     )
+    with whole_file(Path(folder) / "influence.txt") as partial:
+        partial.write_text(_table(table))
     with whole_file(Path(folder) / "influence.png") as partial:
         plot_comparison(table).savefig(partial, dpi=150)
+
+
+# What is read of a comparison, and its heads.
+_READ = {
+    "threshold": "θ",
+    "auc": "AUC",
+    "hit_rate": "hit rate",
+    "false_alarms": "false alarms",
+    "density": "links > θ",
+    "rows_swapped": "rows swapped",
+    "infeasible": "infeasible",
+    "fit_seconds": "fit, s",
+    "score_seconds": "score, s",
+}
+
+
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
+    """The rows over all entities, one experiment after another."""
+    lines: list[str] = []
+    experiment = None
+    for row in rows:
+        if row["entity"] != "all":
+            continue
+        if row["experiment"] != experiment:
+            experiment = row["experiment"]
+            heads = "".join(f"{head:>14}" for head in _READ.values())
+            lines += ["", experiment, f"  {'':<16}{heads}"]
+        values = (float(row[name]) if row[name] else None for name in _READ)
+        cells = "".join(f"{'-' if v is None else f'{v:.3g}':>14}" for v in values)
+        lines.append(f"  {row['estimator']:<16}{cells}")
+    return "\n".join(lines[1:]) + "\n"
 
 
 def _cpu_seconds() -> float:
