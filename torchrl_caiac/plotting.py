@@ -310,7 +310,8 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 color=_COLOURS[n % len(_COLOURS)],
             )
         axes.set_title(title, fontsize=9)
-        axes.set_xticks(range(len(experiments)), [_label(e) for e in experiments])
+        labels = [_label(e) for e in experiments]
+        axes.set_xticks(range(len(experiments)), labels, fontsize=8)
         if kind == "log" and axes.patches:
             axes.set_yscale("log")
         elif kind == "share":

@@ -312,9 +312,15 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
             heads = "".join(f"{head:>14}" for head in _READ.values())
             lines += ["", experiment, f"  {'':<16}{heads}"]
         values = (float(row[name]) if row[name] else None for name in _READ)
-        cells = "".join(f"{'-' if v is None else f'{v:.3g}':>14}" for v in values)
+        cells = "".join(f"{_number(value):>14}" for value in values)
         lines.append(f"  {row['estimator']:<16}{cells}")
     return "\n".join(lines[1:]) + "\n"
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
 
 
 def _cpu_seconds() -> float:
