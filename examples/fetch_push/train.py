@@ -8,6 +8,8 @@ on at its last checkpoint and ends as one that was not; one that is whole goes o
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -80,7 +82,11 @@ def make_buffer(
         fetch_push_reward,
         random=0.5 * cfg.train.counterfactual_ratio if arm == "none" else 0.0,
     )
-    rb = offline_buffer(data, batch_size=cfg.train.batch_size, sample_unit=goals)
+    rb = offline_buffer(
+        data,
+        batch_size=cfg.train.batch_size * cfg.train.batches_at_once,
+        sample_unit=goals,
+    )
     ratio = cfg.train.counterfactual_ratio
     if arm == "coda":
         rb.append_transform(CoDATransform(LAYOUT, cfg.coda.threshold, ratio))
@@ -98,6 +104,14 @@ def make_buffer(
         )
     rb.append_transform(goals)
     return rb
+
+
+def batches(rb: TensorDictReplayBuffer, at_once: int) -> Iterator[TensorDictBase]:
+    """Batches without end, several of which are one sample, which saves time."""
+    while True:
+        rows = rb.sample()
+        # In strides: the last rows of a sample, and so of each, are counterfactual.
+        yield from (rows[first::at_once] for first in range(at_once))
 
 
 def make_features() -> GoalFeatures:
@@ -172,6 +186,13 @@ def load_policy(
 def train(cfg: DictConfig, arm: Arm, seed: int) -> GoalConditionedTD3Loss:
     """Trains one arm with one seed, or loads it where that has been done."""
     settings = cfg.train
+    for name in ("steps", "checkpoint_every"):
+        if settings[name] % settings.batches_at_once:
+            raise ValueError(
+                f"train.{name} is {settings[name]}, wanted a multiple of "
+                f"train.batches_at_once, {settings.batches_at_once}: a run could not "
+                "go on in the middle of a sample"
+            )
     folder = run_folder(cfg, arm, seed)
     kept: dict[str, Any] = OmegaConf.to_container(settings)
     kept.pop("steps")
@@ -181,7 +202,9 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> GoalConditionedTD3Loss:
     features = make_features()
     # Before the networks are made: they copy it.
     features.fit_statistics(
-        torch.cat([rb.sample() for _ in range(_STATISTICS_BATCHES)])
+        torch.cat(
+            list(islice(batches(rb, settings.batches_at_once), _STATISTICS_BATCHES))
+        )
     )
     torch.manual_seed(seed)  # all arms of a seed begin with the same networks
     actor = make_actor(cfg, features)
@@ -211,13 +234,14 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> GoalConditionedTD3Loss:
         mininterval=5,
         position=bar_position(),
     )
+    stream = batches(rb, settings.batches_at_once)
     sums: dict[str, torch.Tensor] = {}
     summed = 0  # fewer than log_every after going on between two logs
     # Denormal numbers slow the networks down; MuJoCo shall have them.
     torch.set_flush_denormal(True)
     try:
         while step < settings.steps:
-            batch = rb.sample()
+            batch = next(stream)
             loss, values = loss_module.value_loss(batch)
             _descend(optimizers["critic_optimizer"], loss)
             step += 1

@@ -25,6 +25,7 @@ SMALL = {
     "train": {
         "steps": 12,
         "batch_size": 64,
+        "batches_at_once": 2,
         "hidden_sizes": [16, 16],
         "log_every": 4,
         "checkpoint_every": 6,
@@ -128,6 +129,21 @@ def test_buffers_of_the_arms(arm, cfg, steps):
         assert not swapped[batch["coda", "action"] > cfg.coda.threshold].any()
     if arm == "coda":
         assert not swapped[batch["coda", "graph"][:, -1] > cfg.coda.threshold].any()
+
+
+def test_batches_of_one_sample_are_alike(cfg, steps):
+    train = steps["train"]
+    rows = train.training_rows(steps["collect"].load_rows(cfg), "caiac")
+    torch.manual_seed(0)
+    stream = train.batches(train.make_buffer(rows, cfg, "caiac"), at_once=2)
+    for batch in (next(stream) for _ in range(4)):
+        assert len(batch) == 64
+        marks = batch["caiac", "counterfactual"]
+        assert not marks[:32].any() and marks[32:].all()
+    other = cfg.copy()
+    other.train.checkpoint_every = 5
+    with pytest.raises(ValueError, match=r"checkpoint_every is 5, wanted a multiple"):
+        train.train(other, "caiac", seed=0)
 
 
 def test_a_killed_training_ends_as_one_that_was_not(cfg, steps, monkeypatch):
