@@ -6,26 +6,25 @@ and the figure that ``make influence`` publishes, with the kitchen's.
 
 from __future__ import annotations
 
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
-from collect import collect, rows_folder
-from fit_world_model import LAYOUT, fit, fit_transformer
+from collect import collect
+from fit_world_model import LAYOUT, fit, fit_seconds, fit_transformer
 from omegaconf import DictConfig
 from score import make_truth, simulator_truth
 
-from torchrl_caiac import CAIACTransform, CoDATransform
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.experiments import claim_folder, quick_settings
 from torchrl_caiac.influence import (
     CAI,
-    AttentionInfluence,
     Candidate,
     DistanceInfluence,
     compare_influence,
+    paper_candidates,
     publish_comparison,
 )
 
@@ -33,43 +32,17 @@ POSITIONS = {name: LAYOUT.columns[name][:3] for name in LAYOUT.names}
 
 
 def candidates(cfg: DictConfig) -> dict[str, Candidate]:
-    """The estimators as the arms of the study use them, and two distance rules."""
-    gaussian, transformer = fit(cfg), fit_transformer(cfg)
-    seconds = {
-        name: json.loads((rows_folder(cfg) / f"{name}_fit.json").read_text())["seconds"]
-        for name in ("world_model", "transformer")
-    }
-    smoothing = cfg.score.smoothing
-    return {
-        "caiac": Candidate(
-            CAI(gaussian, num_actions=cfg.score.num_actions),
-            CAIACTransform(LAYOUT, cfg.score.threshold),
-            smoothing,
-            seconds["world_model"],
-        ),
-        "coda": Candidate(
-            AttentionInfluence(transformer),
-            CoDATransform(LAYOUT, cfg.coda.threshold),
-            smoothing,
-            seconds["transformer"],
-        ),
-        "coda_action": Candidate(
-            AttentionInfluence(transformer, action_only=True),
-            CAIACTransform(LAYOUT, cfg.coda.threshold),
-            smoothing,
-            seconds["transformer"],
-        ),
-        "distance": Candidate(
-            DistanceInfluence(LAYOUT, POSITIONS), CoDATransform(LAYOUT, 0.5)
-        ),
-        "distance_action": Candidate(
-            DistanceInfluence(LAYOUT, POSITIONS, action_only=True),
-            CAIACTransform(LAYOUT, 0.5),
-        ),
-        "oracle": Candidate(
-            make_truth(cfg, cfg.truth.oracle_actions), CAIACTransform(LAYOUT, 0.5)
-        ),
-    }
+    """The estimators as the arms of the study use them, and the distance rule."""
+    return paper_candidates(
+        CAI(fit(cfg), num_actions=cfg.score.num_actions),
+        fit_transformer(cfg),
+        partial(DistanceInfluence, LAYOUT, POSITIONS),
+        make_truth(cfg, cfg.truth.oracle_actions),
+        threshold=cfg.score.threshold,
+        attention_threshold=cfg.coda.threshold,
+        smoothing=cfg.score.smoothing,
+        fit_seconds=(fit_seconds(cfg, "world_model"), fit_seconds(cfg, "transformer")),
+    )
 
 
 def compare(cfg: DictConfig) -> list[dict[str, Any]]:

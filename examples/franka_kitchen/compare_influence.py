@@ -7,29 +7,29 @@ and the figure that ``make influence`` publishes, with Fetch-Push's;
 
 from __future__ import annotations
 
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
 from collect import collect
-from fit_world_model import fit, fit_transformer
+from fit_world_model import fit, fit_seconds, fit_transformer
 from omegaconf import DictConfig
 from score import simulator_truth
 from tensordict import TensorDictBase
 
-from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
 from torchrl_caiac.experiments import claim_folder, quick_settings
 from torchrl_caiac.influence import (
     CAI,
-    AttentionInfluence,
     Candidate,
     DistanceInfluence,
     SimulatorInfluence,
     compare_influence,
+    paper_candidates,
     publish_comparison,
 )
 
@@ -43,49 +43,22 @@ HANDLES = EntityLayout(
 
 
 def candidates(cfg: DictConfig) -> dict[str, Candidate]:
-    """The estimators as the arms of the demo use them, and two distance rules."""
-    gaussian, transformer = fit(cfg), fit_transformer(cfg)
-    seconds = {
-        name: json.loads((Path(cfg.out) / f"{name}_fit.json").read_text())["seconds"]
-        for name in ("world_model", "transformer")
-    }
-    smoothing, workers = cfg.score.smoothing, cfg.collect.workers
-    positions = dict(HANDLES.columns)
-    return {
-        "caiac": Candidate(
-            CAI(gaussian, num_actions=cfg.score.num_actions),
-            CAIACTransform(LAYOUT, cfg.score.threshold),
-            smoothing,
-            seconds["world_model"],
+    """The estimators as the arms of the demo use them, and the distance rule."""
+    workers = cfg.collect.workers
+    return paper_candidates(
+        CAI(fit(cfg), num_actions=cfg.score.num_actions),
+        fit_transformer(cfg),
+        partial(DistanceInfluence, HANDLES, dict(HANDLES.columns)),
+        SimulatorInfluence(
+            KitchenEnv,
+            num_actions=cfg.score.oracle_actions,
+            num_workers=workers if workers > 1 else 0,
         ),
-        "coda": Candidate(
-            AttentionInfluence(transformer),
-            CoDATransform(LAYOUT, cfg.coda.threshold),
-            smoothing,
-            seconds["transformer"],
-        ),
-        "coda_action": Candidate(
-            AttentionInfluence(transformer, action_only=True),
-            CAIACTransform(LAYOUT, cfg.coda.threshold),
-            smoothing,
-            seconds["transformer"],
-        ),
-        "distance": Candidate(
-            DistanceInfluence(HANDLES, positions), CoDATransform(LAYOUT, 0.5)
-        ),
-        "distance_action": Candidate(
-            DistanceInfluence(HANDLES, positions, action_only=True),
-            CAIACTransform(LAYOUT, 0.5),
-        ),
-        "oracle": Candidate(
-            SimulatorInfluence(
-                KitchenEnv,
-                num_actions=cfg.score.oracle_actions,
-                num_workers=workers if workers > 1 else 0,
-            ),
-            CAIACTransform(LAYOUT, 0.5),
-        ),
-    }
+        threshold=cfg.score.threshold,
+        attention_threshold=cfg.coda.threshold,
+        smoothing=cfg.score.smoothing,
+        fit_seconds=(fit_seconds(cfg, "world_model"), fit_seconds(cfg, "transformer")),
+    )
 
 
 def with_readings(data: TensorDictBase) -> TensorDictBase:

@@ -9,7 +9,9 @@ at its last checkpoint.
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -54,6 +56,12 @@ def fit_transformer(cfg: DictConfig) -> TransformerWorldModel:
         variance_floor=settings.variance_floor,
     )
     return _fitted(model, cfg, "transformer")
+
+
+def fit_seconds(cfg: DictConfig, name: str) -> float:
+    """The processor time that fitting a model took; NaN where it was interrupted."""
+    path = Path(cfg.out) / f"{name}_fit.json"
+    return json.loads(path.read_text())["seconds"] if path.exists() else math.nan
 
 
 def _fitted(model: Any, cfg: DictConfig, name: str) -> Any:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import math
+from functools import partial
 from itertools import product
 
 import pytest
@@ -13,12 +14,17 @@ from torchrl.data import LazyTensorStorage
 
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.influence import (
+    CAI,
     Candidate,
+    DistanceInfluence,
     compare_influence,
+    paper_candidates,
     publish_comparison,
     swap_shares,
 )
+from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 
+NAMES = ("arm", "cup", "box")
 LAYOUT = EntityLayout({"arm": [0], "cup": [1], "box": [2]}, fixed=["arm"])
 
 
@@ -163,6 +169,29 @@ def test_estimators_are_compared_on_the_same_rows():
     # Of nine links that are not to oneself only the action's are ever there.
     everything = (data["observation"] > 0.5).float().mean().item()
     assert graph["density"] == pytest.approx(everything / 3)
+
+
+def test_the_paper_s_estimators_and_their_thresholds():
+    rule = partial(DistanceInfluence, LAYOUT, {n: [i] for i, n in enumerate(NAMES)})
+    found = paper_candidates(
+        CAI(GaussianWorldModel(LAYOUT, 1, (8,)), num_actions=4),
+        TransformerWorldModel(LAYOUT, 1, layers=1, heads=2, width=8),
+        rule,
+        rule(action_only=True),
+        threshold=0.05,
+        attention_threshold=0.2,
+        smoothing=3,
+        fit_seconds=(1.0, 2.0),
+    )
+    thresholds = {name: c.transform.threshold for name, c in found.items()}
+    assert list(thresholds.values()) == [0.05, 0.2, 0.2, 0.5, 0.5, 0.5]
+    smoothing = {name: (c.smoothing, c.fit_seconds) for name, c in found.items()}
+    assert smoothing["caiac"] == (3, 1.0)
+    assert smoothing["coda"] == smoothing["coda_action"] == (3, 2.0)
+    assert smoothing["oracle"][0] == 1
+    # Each transform reads what its estimator scores.
+    table = compare_influence(rows(), rows()["observation"] > 0.5, found)
+    assert {row["estimator"] for row in table} == set(found)
 
 
 def test_experiments_share_the_published_table(tmp_path):

@@ -7,6 +7,7 @@ from torchrl_caiac.influence.cai import CAI, causal_action_influence
 from torchrl_caiac.influence.comparison import (
     Candidate,
     compare_influence,
+    paper_candidates,
     publish_comparison,
     swap_shares,
 )
@@ -35,6 +36,7 @@ __all__ = [
     "compare_influence",
     "influence_report",
     "oracle_score",
+    "paper_candidates",
     "publish_comparison",
     "roc_auc",
     "score_buffer",
