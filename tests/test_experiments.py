@@ -281,6 +281,10 @@ from torchrl_caiac.experiments import bar_position, claim_folder, run_side_by_si
 from torchrl_caiac.influence import true_influence
 
 
+def calls(function, *args):
+    return function(*args)
+
+
 def looks_around(folder, number, after):
     """Finishes when another job has begun."""
     (folder / str(number)).touch()
@@ -333,6 +337,13 @@ def jobs(tmp_path, monkeypatch):
 
 
 class TestSideBySide:
+    def test_a_job_leaves_its_threads_to_no_other(self, jobs, monkeypatch):
+        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+        # A worker that is given four threads by one job has one in the next.
+        calls = [(torch.set_num_threads, 4), (torch.get_num_threads,)]
+        found = dict(run_side_by_side(jobs.calls, calls, processes=1))
+        assert found[1] == 1
+
     def test_in_order_of_finishing_one_thread_each(self, jobs, tmp_path, monkeypatch):
         monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
         folder = tmp_path / "finished"

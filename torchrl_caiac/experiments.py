@@ -396,7 +396,7 @@ def run_side_by_side(
         # No more than there are processes: the pool cannot take a job back that it has
         # put aside for the next free process.
         for number, job in islice(waiting, count):
-            running[pool.submit(function, *job)] = number
+            running[pool.submit(_on_one_thread, function, job)] = number
 
     try:
         start(processes)
@@ -430,9 +430,15 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+def _on_one_thread(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
+    # Before every job: the one before may have left more, and the threads of several
+    # processes that wait for each other make everything a hundred times slower.
+    torch.set_num_threads(1)
+    return function(*job)
+
+
 def _start_worker(counter: Any) -> None:
     end_with_parent()
-    torch.set_num_threads(1)
     with counter.get_lock():
         os.environ[_POSITION] = str(counter.value)
         counter.value += 1
