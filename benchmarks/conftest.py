@@ -56,10 +56,10 @@ def judge(benchmark: Any, request: pytest.FixtureRequest) -> Callable[..., None]
         at_least: float | None = None,
         at_most: float | None = None,
     ) -> None:
-        if (at_least is None) == (at_most is None):
-            raise ValueError("a ratio has one target, at_least or at_most")
         target = at_most if at_least is None else at_least
-        judged = Judged(name, value, target, at_least is not None)  # type: ignore[arg-type]
+        if target is None or None not in (at_least, at_most):
+            raise ValueError("a ratio has one target, at_least or at_most")
+        judged = Judged(name, value, target, at_least is not None)
         request.config.stash.setdefault(_JUDGED, []).append(judged)
         benchmark.extra_info[name] = {
             "ratio": round(value, 4),

@@ -431,8 +431,7 @@ def end_with_parent() -> None:
 
 
 def _on_one_thread(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
-    # Before every job: the one before may have left more, and the threads of several
-    # processes that wait for each other make everything a hundred times slower.
+    # Before every job: the one before may have left more, as TorchRL's environments do.
     torch.set_num_threads(1)
     return function(*job)
 

@@ -40,6 +40,7 @@ def evaluate_task(
 ) -> list[dict[str, Any]]:
     """Plays episodes of one task side by side; one result an episode."""
     torch.manual_seed(seed)
+    threads = torch.get_num_threads()
     actor = LMPActor(model)
     base = SerialEnv(episodes, partial(make_kitchen_env, task, start=start))
     env = TransformedEnv(base, actor.make_tensordict_primer())
@@ -49,6 +50,9 @@ def evaluate_task(
             rollout = env.rollout(10_000, actor, break_when_all_done=True)
     finally:
         env.close()
+        # TorchRL gives torch more threads when environments close, and processes side
+        # by side then wait for each other's.
+        torch.set_num_threads(threads)
         # A kitchen holds 60 MB that Python's collector does not know of.
         del env, base
         gc.collect()

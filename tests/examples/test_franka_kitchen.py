@@ -269,11 +269,13 @@ def test_all_tasks(tmp_path, steps, monkeypatch):
 
     monkeypatch.setattr(KitchenEnv, "reset", kept)
     cfg.evaluate.episodes = 1
+    threads = torch.get_num_threads()
     results = steps["evaluate"].evaluate(cfg, "caiac", seed=0)
     moved = abs(starts[-1] - KitchenEnv.default_state()) > 1e-3
     columns = KitchenEnv.layout.columns
     assert moved[9:].any()
     assert not moved[list(columns["kettle"])].any()
+    assert torch.get_num_threads() == threads
     cfg.demo.arms = ["caiac"]
     table = steps["demo"].report_table(cfg, report, 0.5, results, {"collect": 1.0})
     assert "caiac        kettle" in table

@@ -174,6 +174,7 @@ def _kernel(
     """The kernel for entities of some width, for any rows and K; None without one."""
     if device in _without_compiler:
         return None
+    # torch's annotations do not know isolate_recompiles yet.
     kernel = torch.compile(  # type: ignore[call-overload]
         _pair_sums, fullgraph=True, dynamic=True, isolate_recompiles=True
     )

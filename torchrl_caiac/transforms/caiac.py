@@ -86,7 +86,7 @@ class CAIACTransform(CounterfactualTransform):
             ``("next", "done")``.
         check (bool): check the values of each batch: scores, windows, observations.
             On a CUDA device nothing waits for the result, so that an error comes with
-            a later sample and names no rows. Defaults to ``True``.
+            a later sample. Defaults to ``True``.
 
     Raises:
         TypeError: an argument has the wrong type.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 __all__ = ["LateCheck"]
@@ -27,8 +29,8 @@ class LateCheck:
     """
 
     def __init__(self) -> None:
-        self._sums: torch.Tensor | None = None
-        self._arrived: torch.Tensor | None = None
+        # The sums on the device, and what of them has arrived on the host.
+        self._sums: tuple[torch.Tensor, torch.Tensor] | None = None
 
     @staticmethod
     def needed(device: torch.device) -> bool:
@@ -48,15 +50,19 @@ class LateCheck:
         Args:
             values (torch.Tensor): ``[V]``, of the same meaning in every batch.
         """
-        sums = self._sums
-        if sums is None or sums.device != values.device or len(sums) != len(values):
+        known = self._sums
+        if known is None or (known[0].shape, known[0].device) != (
+            values.shape,
+            values.device,
+        ):
             sums = torch.zeros_like(values, dtype=torch.float64)
-            self._arrived = torch.zeros(
-                len(values), dtype=torch.float64, pin_memory=values.is_cuda
+            arrived = torch.zeros(
+                values.shape, dtype=torch.float64, pin_memory=values.is_cuda
             )
-            self._sums = sums
+            known = self._sums = sums, arrived
+        sums, arrived = known
         sums += values
-        self._arrived.copy_(sums, non_blocking=True)  # type: ignore[union-attr]
+        arrived.copy_(sums, non_blocking=True)
 
     def found(self) -> list[int]:
         """What was not finite in any batch that has arrived; starts over if there was.
@@ -64,12 +70,12 @@ class LateCheck:
         Returns:
             list of int: places in ``values``.
         """
-        if self._arrived is None:
+        if self._sums is None:
             return []
-        sums = self._arrived.tolist()
-        bad = [place for place, value in enumerate(sums) if value - value != 0]
+        arrived = self._sums[1].tolist()
+        bad = [place for place, value in enumerate(arrived) if not math.isfinite(value)]
         if bad:
-            self._sums = self._arrived = None
+            self._sums = None
         return bad
 
     def __reduce__(self) -> tuple[type[LateCheck], tuple[()]]:
