@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
 from tensordict import TensorDict, TensorDictBase
+
+from tests.pretend_cuda import pretend_cuda
 
 FLAT_LENGTHS = (7, 12, 9, 5)
 STATE_WIDTH, ACTION_WIDTH, GOAL_WIDTH = 9, 2, 4
@@ -20,16 +24,14 @@ def pytest_configure() -> None:
     settings.load_profile("shared")
 
 
-def pytest_collection_modifyitems(
-    config: pytest.Config, items: list[pytest.Item]
-) -> None:
-    """Leaves tests that are marked ``gpu`` out where there is no CUDA device."""
-    if torch.cuda.is_available():
-        return
-    without = [item for item in items if item.get_closest_marker("gpu")]
-    if without:
-        config.hook.pytest_deselected(items=without)
-        items[:] = [item for item in items if not item.get_closest_marker("gpu")]
+@pytest.fixture(autouse=True)
+def cuda(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A stand-in for the device of tests marked ``gpu`` where there is none."""
+    is_needed = request.node.get_closest_marker("gpu") is not None
+    with (
+        pretend_cuda() if is_needed and not torch.cuda.is_available() else nullcontext()
+    ):
+        yield
 
 
 @pytest.fixture

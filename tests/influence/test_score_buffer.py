@@ -27,12 +27,14 @@ from torchrl.data import (
 )
 
 from torchrl_caiac import EntityLayout
+from torchrl_caiac.influence import AttentionInfluence, DistanceInfluence
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.score_buffer import (
     MarkUnscored,
     score_buffer,
     score_file,
 )
+from torchrl_caiac.modules import TransformerWorldModel
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 
 KEY = ("caiac", "score")
@@ -815,3 +817,42 @@ def test_rows_that_are_not_finite_are_named_by_their_place():
     fast = CAI(GaussianWorldModel(layout, 2, (8,)), mode="fast", threshold=1e-4)
     with pytest.raises(ValueError, match=r"state of the rows \[33\]"):
         score_buffer(filled(rows), fast, progress=False)
+
+
+# --- on a GPU ------------------------------------------------------------------------
+
+
+def model_cai(**kwargs):
+    return CAI(GaussianWorldModel(LAYOUT, 2, (16, 16)), 32, **kwargs)
+
+
+def attention(**kwargs):
+    return AttentionInfluence(TransformerWorldModel(LAYOUT, 2, 2, 2, 8), **kwargs)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("where", ["cpu", "cuda"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: model_cai(compile=False),
+        lambda: model_cai(compile=False, mode="fast", threshold=0.05),
+        lambda: attention(),
+        lambda: attention(action_only=True),
+        lambda: DistanceInfluence(LAYOUT, {"arm": [0], "cup": [1], "pot": [2]}, "arm"),
+    ],
+    ids=["exact", "fast", "graph", "action", "distance"],
+)
+def test_scores_of_a_gpu_are_those_of_the_cpu(make, where):
+    rows = episodes([9, 14, 8])
+    torch.manual_seed(0)
+    estimator = make().eval()
+    found = []
+    for device, storage in (("cpu", "cpu"), ("cuda", where)):
+        rb = ReplayBuffer(storage=LazyTensorStorage(len(rows), device=storage))
+        rb.extend(rows.to(storage))
+        score_buffer(rb, estimator.to(device), smoothing=3, lookahead=2, progress=False)
+        scores = rb.storage[:][KEY]
+        assert scores.device.type == storage
+        found.append(scores.cpu())
+    torch.testing.assert_close(found[1], found[0], atol=1e-5, rtol=1e-4)

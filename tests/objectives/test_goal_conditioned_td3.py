@@ -13,6 +13,7 @@ from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
+from tests.pretend_cuda import nothing_waits
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules import (
     GoalConditionedActor,
@@ -78,7 +79,14 @@ class PlainCritic(GoalConditionedCritic):
 
 
 def make_loss(
-    *, layout=None, dtype=None, gamma=GAMMA, keys=None, plain=False, **kwargs
+    *,
+    layout=None,
+    dtype=None,
+    gamma=GAMMA,
+    keys=None,
+    plain=False,
+    device="cpu",
+    **kwargs,
 ):
     torch.manual_seed(0)
     keys = keys or {}
@@ -101,7 +109,8 @@ def make_loss(
         )
         for _ in range(2)
     ]
-    loss = GoalConditionedTD3Loss(actor, critics, **kwargs)
+    networks = [network.to(device) for network in (actor, *critics)]
+    loss = GoalConditionedTD3Loss(networks[0], networks[1:], **kwargs)
     if keys:
         loss.set_keys(**keys)
     loss.make_value_estimator(gamma=gamma)
@@ -109,7 +118,7 @@ def make_loss(
     # Targets that differ from what they follow, as they do in training.
     for name, value in loss.named_buffers():
         if name.startswith("target_") and ".network." in name:
-            value.add_(0.3 * torch.randn_like(value))
+            value.add_(0.3 * torch.randn(value.shape).to(value))
     return loss
 
 
@@ -811,3 +820,26 @@ def test_learns_to_reach_goals_from_random_data(dtype):
             updater.step()
     assert untrained < 0.3
     assert reached_share(actor) > 0.95
+
+
+# --- on a GPU ------------------------------------------------------------------------
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16])
+def test_losses_of_a_gpu_are_those_of_the_cpu_and_wait_for_nothing(dtype):
+    batch = make_batch(64)
+    found = []
+    for device in ("cpu", "cuda"):
+        loss = make_loss(dtype=dtype, policy_noise=0.0, bc_alpha=2.5, device=device)
+        updater, rows = SoftUpdate(loss, tau=0.5), batch.to(device)
+        loss.value_loss(rows)
+        with nothing_waits():
+            values = [loss.value_loss(rows)[0], loss.actor_loss(rows)[0]]
+            updater.step()
+        assert all(value.device.type == device for value in values)
+        found.append(torch.stack(values).detach().cpu())
+    tolerance = (
+        {"atol": 1e-5, "rtol": 1e-4} if dtype is None else {"atol": 0.02, "rtol": 0.02}
+    )
+    torch.testing.assert_close(found[1], found[0], **tolerance)
