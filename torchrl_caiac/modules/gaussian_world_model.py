@@ -18,6 +18,7 @@ from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
     evaluating,
 )
+from torchrl_caiac.modules.linear import linear
 
 __all__ = ["GaussianWorldModel", "gaussian_nll"]
 
@@ -201,8 +202,9 @@ class GaussianWorldModel(EntityDynamicsModel):
             self.state_norm(state.to(dtype)), weight[:, : self.state_dim], first.bias
         ) + F.linear(self.action_norm(action.to(dtype)), weight[:, self.state_dim :])
         x = F.relu(x, inplace=True)
-        for layer in self.hidden[1:]:
-            x = F.relu(layer(x), inplace=True)
+        later: Any = self.hidden[1:]
+        for layer in later:
+            x = linear(x, layer.weight, layer.bias, relu=True)
         raw = F.softplus(self.var_head(x))
         var = (raw + self._variance_floor().to(dtype)).clamp_max(self.max_variance)
         return self.loc_head(x), var
