@@ -18,6 +18,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 import subprocess
 import sys
 import time
@@ -26,7 +27,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -206,6 +207,42 @@ def bench_estimator(
     agree = ((fast(sample) <= shape.threshold) == below).double().mean().item()
     judge(f"{name}, fast, masks as by float64", agree, at_least=0.999)
     benchmark.pedantic(exact, args=(td,), rounds=3)
+
+
+@pytest.mark.parametrize("mode", ["exact", "fast"])
+@pytest.mark.parametrize("name", ["Fetch-Push", "kitchen"])
+def bench_threads(
+    benchmark: Any,
+    name: str,
+    mode: Literal["exact", "fast"],
+    device: torch.device,
+    judge: Callable[..., None],
+) -> None:
+    """``score_buffer`` with one thread and with one for each of up to four cores."""
+    if device.type != "cpu":
+        pytest.skip("threads of the host do not score on a GPU")
+    shape, rows = fitted(name), 16_384
+    states = shape.some(rows, device)
+    states["next"] = states.clone()
+    states["episode"] = torch.arange(rows) // 100
+    rb = ReplayBuffer(storage=TensorStorage(states))
+    estimator = CAI(
+        shape.model.eval(), compile=True, mode=mode, threshold=shape.threshold
+    )
+
+    def score(threads: int) -> None:
+        torch.set_num_threads(threads)
+        score_buffer(rb, estimator, done_key=None, overwrite=True, progress=False)
+
+    cores = min(4, len(os.sched_getaffinity(0)))
+    calls = {n: partial(score, n) for n in (1, cores)}
+    spent = seconds(calls, rounds=3, warmup=1)
+    judge(
+        f"{name}, {mode}, {cores} threads / 1, rate",
+        spent[1] / spent[cores],
+        at_least=0.75 * cores,
+    )
+    benchmark.pedantic(calls[cores], rounds=1)
 
 
 @MODELS

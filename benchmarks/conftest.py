@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,11 +34,17 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """One thread, denormals flushed: what the scripts do."""
+    """One thread, denormals flushed: what the scripts do.
+
+    What earlier benchmarks have left is no garbage to search during this one.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
+    gc.collect()
+    gc.freeze()
     yield
+    gc.unfreeze()
     torch.set_flush_denormal(False)
     torch.set_num_threads(threads)
 

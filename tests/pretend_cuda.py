@@ -118,6 +118,10 @@ def _computed(func: Any, args: Any, kwargs: Any) -> Any:
     else:
         to_cuda = torch.device(wanted).type == "cuda"
         kwargs = {**kwargs, "device": torch.device("cpu")}
+    if name == "_foreach_copy_":
+        for own, other in zip(args[0], args[1], strict=True):
+            own.copy_(other, *args[2:], **kwargs)
+        return None
     if name in ("copy_", "_to_copy"):
         crosses = isinstance(args[1 if name == "copy_" else 0], OnCuda) != to_cuda
         asynchronous = args[2] if len(args) > 2 else kwargs.get("non_blocking", False)

@@ -261,6 +261,26 @@ def test_a_generator_of_the_host_serves_a_gpu(window: int) -> None:
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("layout", [FLAT, NESTED], ids=["flat", "nested"])
+@pytest.mark.parametrize("kind", [CAIACTransform, CoDATransform])
+@pytest.mark.parametrize("window", [1, WINDOW])
+def test_donors_of_the_host_serve_a_gpu(
+    layout: EntityLayout, kind: type, window: int
+) -> None:
+    donors = LazyTensorStorage(EPISODES * LENGTH)
+    donors.set(range(EPISODES * LENGTH), rows(layout))
+    found = []
+    for device in ("cpu", "cuda"):
+        augment = kind(layout, window=window, donors=donors, swap_prob=0.9)
+        augment.set_generator(torch.Generator().manual_seed(3))
+        td = rows(layout).view(EPISODES, LENGTH)[:, :8].reshape(-1)
+        found.append(augment(td.to(device)))
+    assert all(leaf.is_cuda for leaf in found[1].values(True, True))
+    assert found[0]["caiac", "swapped"].any()
+    assert (found[1].cpu() == found[0]).all()
+
+
+@pytest.mark.gpu
 def test_errors_come_late_on_the_gpu() -> None:
     transform = CAIACTransform(FLAT)
     good = rows(FLAT)[:8].to("cuda")
