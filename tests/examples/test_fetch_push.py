@@ -39,7 +39,7 @@ SMALL = {
 def steps():
     """The scripts of the example, as modules."""
     names = ("collect", "fit_world_model", "score", "train", "evaluate", "study")
-    names = (*names, "compare_influence")
+    names = (*names, "compare_influence", "compare_precision")
     before = set(sys.modules)
     sys.path.insert(0, str(FOLDER))
     yield {name: importlib.import_module(name) for name in names}
@@ -335,3 +335,19 @@ def test_starts_are_shared_and_fresh(cfg, steps):
     assert torch.equal(first["observation"], second["observation"])
     rows = steps["collect"].load_rows(cfg)
     assert torch.cdist(first["desired_goal"], rows["desired_goal"]).min() > 1e-4
+
+
+def test_precisions_are_compared_over_the_steps_that_all_seeds_have(steps, tmp_path):
+    rows = [(1, 20, 0.5), (0, 10, 0.1), (0, 20, 0.2), (1, 10, 0.3)]
+    table = ["fraction,arm,seed,step,full"]
+    table += [f"1.0,caiac,{seed},{step},{full}" for seed, step, full in rows]
+    for name in ("a", "b"):
+        (tmp_path / f"fetch_push_{name}.csv").write_text("\n".join(table))
+    read_curves = steps["compare_precision"].read_curves
+    curves = read_curves(tmp_path / "fetch_push_a.csv")
+    assert curves == ([10, 20], [[0.1, 0.2], [0.3, 0.5]])
+    steps["compare_precision"].main(["--results", str(tmp_path), "--names", "a", "b"])
+    assert (tmp_path / "fetch_push_precision.png").stat().st_size > 10_000
+    (tmp_path / "fetch_push_a.csv").write_text("\n".join(table[:-1]))
+    with pytest.raises(ValueError, match=r"lacks steps of the seeds \[1\]"):
+        read_curves(tmp_path / "fetch_push_a.csv")
