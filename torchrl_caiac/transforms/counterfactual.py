@@ -378,17 +378,17 @@ class CounterfactualTransform(Transform, ABC):
     ) -> None:
         """Raises where values make no sense: on CUDA devices, with a later batch."""
         observed = self._observed(after)
-        crossing = self._crossing(before)
+        neighbours = self._neighbours(before)
         leaves = [scores, *(leaf for _, leaf in observed)]
         # A sum is finite if all its terms are (unless it overflows: looked at below).
         if not LateCheck.needed(scores.device):
             finite = math.isfinite(sum(leaf.sum().item() for leaf in leaves))
-            if not finite or (crossing is not None and bool(crossing.any())):
-                self._explain(after, scores, crossing)
+            if not finite or not (neighbours is None or torch.equal(*neighbours)):
+                self._explain(after, scores, neighbours)
             return
         found = self._late.found()
         if found:
-            self._explain(after, scores, crossing)  # it is likely wrong here too
+            self._explain(after, scores, neighbours)  # it is likely wrong here too
             names = [self.score_key, *(key for key, _ in observed), "the windows"]
             raise ValueError(
                 f"{[names[place] for place in found]} made no sense in a batch that "
@@ -397,26 +397,32 @@ class CounterfactualTransform(Transform, ABC):
                 "errors come late; sample the same data on the CPU to learn the rows"
             )
         sums = [leaf.sum(dtype=torch.float64) for leaf in leaves]
-        if crossing is not None:
-            sums.append(torch.where(crossing.any(), math.nan, 0.0).double())
+        if neighbours is not None:
+            crosses = (neighbours[0] != neighbours[1]).any()
+            sums.append(torch.where(crosses, math.nan, 0.0).double())
         self._late.add(torch.stack(sums))
 
-    def _crossing(self, td: TensorDictBase) -> torch.Tensor | None:
-        """Bool ``[B, window - 1]``: where a window goes over a trajectory's end."""
+    def _neighbours(
+        self, td: TensorDictBase
+    ) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Two ``[B, window - 1]`` that are equal where windows stay in a trajectory."""
         if self.window == 1:
             return None
         ids = td.get(self.trajectory_key, None)
         if ids is not None:
             ids = ids.reshape(-1, self.window)
-            return ids[:, 1:] != ids[:, :-1]
+            return ids[:, 1:], ids[:, :-1]
         done = td.get(self.done_key, None)
-        return None if done is None else done.reshape(-1, self.window)[:, :-1].bool()
+        if done is None:
+            return None
+        done = done.reshape(-1, self.window)[:, :-1].bool()
+        return done, torch.zeros_like(done)
 
     def _explain(
         self,
         after: TensorDictBase,
         scores: torch.Tensor,
-        crossing: torch.Tensor | None,
+        neighbours: tuple[torch.Tensor, torch.Tensor] | None,
     ) -> None:
         names = self.layout.names
         nan, infinite = scores.isnan(), scores.isinf()
@@ -434,8 +440,9 @@ class CounterfactualTransform(Transform, ABC):
                 f"{self.score_key!r} is infinite for {who}: check the influence "
                 "measure, then call score_buffer(..., overwrite=True)"
             )
-        if crossing is not None and crossing.any():
-            window = int(crossing.any(1).nonzero()[0, 0])
+        if neighbours is not None and not torch.equal(*neighbours):
+            crosses = neighbours[0] != neighbours[1]
+            window = int(crosses.any(1).nonzero()[0, 0])
             raise ValueError(
                 f"window {window} of {self.window} rows crosses a trajectory's end: "
                 f"use SliceSampler with slice_len={self.window} and "

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -173,6 +174,12 @@ def _wanted(
     return free & (chance < swap_prob)
 
 
+@lru_cache(maxsize=64)
+def _window_starts(windows: int, window: int, device: torch.device) -> torch.Tensor:
+    """The first row of each window, int64 ``[B]``; not to be written to."""
+    return torch.arange(0, windows * window, window, device=device)
+
+
 def draw_batch_donors(
     free: torch.Tensor,
     num_counterfactual: int,
@@ -223,9 +230,9 @@ def draw_batch_donors(
     place = (pick % (size - 1) + own) % size
     # listed[n, r]: the free window of rank r, from 1; those that are not free end up
     # at 0.
-    starts = torch.arange(0, windows * window, window, device=free.device)
+    starts = _window_starts(windows, window, free.device).expand(entities, -1)
     listed = rank.new_zeros(entities, windows + 2)
-    listed.scatter_(1, rank * free, starts.expand(entities, -1))
+    listed.scatter_(1, rank * free, starts)
     swapped = wanted & (total > 1)
     return SwapDraw(
         listed[:, 1:].gather(1, place).t(), swapped.t(), (wanted ^ swapped).sum(1)
@@ -858,8 +865,11 @@ def apply_swap(
     if not changed:
         return out
     first = td.shape[0] - changed * window
-    own = torch.arange(first, td.shape[0], window, device=draw.swapped.device)
-    own = own.unsqueeze(-1) if donors is None else own.new_zeros(changed, 1)
+    if donors is None:
+        starts = _window_starts(len(td) // window, window, draw.swapped.device)
+        own = starts[-changed:].unsqueeze(-1)
+    else:
+        own = draw.donors.new_zeros(changed, 1)
     # Where nothing is swapped, a row of the batch is its own donor; one more entity,
     # which never swaps, owns the columns that no entity owns.
     rows = torch.cat([torch.where(draw.swapped, draw.donors, own), own], -1)
