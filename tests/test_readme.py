@@ -17,8 +17,9 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.data import load_transitions, mix_trajectories, offline_buffer
-from torchrl_caiac.influence import AttentionInfluence, score_buffer
+from torchrl_caiac.influence import CAI, AttentionInfluence, score_buffer
 from torchrl_caiac.modules import (
+    GaussianWorldModel,
     GoalConditionedActor,
     GoalConditionedCritic,
     GoalFeatures,
@@ -92,6 +93,7 @@ def run_usage(start: str, **given: object) -> dict[str, object]:
     (code,) = [block for block in USAGE if block.startswith(start)]
     scope = {
         "AttentionInfluence": AttentionInfluence,
+        "CAI": CAI,
         "CAIACTransform": CAIACTransform,
         "CoDATransform": CoDATransform,
         "GoalConditionedActor": GoalConditionedActor,
@@ -193,3 +195,16 @@ def test_coda(scored: TensorDictBase) -> None:
     run_usage("attention = ", rb=rb, transformer=model)
     assert rb.sample()["coda", "graph"].shape == (8, 4, 3)
     assert rb.sample()["caiac", "swapped"].shape == (8, 3)
+
+
+@pytest.mark.gpu
+@in_memory
+def test_on_a_gpu(flat_data: TensorDictBase) -> None:
+    model = GaussianWorldModel(LAYOUT, 2, (16, 16))
+    rb = run_usage("model.to", data=flat_data, model=model)["rb"]
+    batch = rb.sample()
+    assert all(leaf.is_cuda for leaf in batch.values(True, True))
+    assert batch["caiac", "swapped"].shape == (512, 3)
+    scores = rb.storage[:]["caiac", "score"].cpu()
+    score_buffer(rb, CAI(model.to("cpu")), overwrite=True, progress=False)
+    torch.testing.assert_close(rb.storage[:]["caiac", "score"].cpu(), scores)
