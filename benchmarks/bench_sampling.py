@@ -4,7 +4,8 @@ Run with ``pytest benchmarks/bench_sampling.py`` (``make bench``). Two shapes: 5
 transitions of Fetch-Push (34 columns, 3 entities) and 500 windows of 20 rows of the
 kitchen (30 columns, 10 entities), from storages of 10 k, 1 M and 10 M rows in memory
 and memory-mapped. ``-k 10k`` or ``-k "not 10M and not growth"`` keeps it short: the
-largest storage takes 4 GB of disk or memory. With ``--device=cuda`` there are storages
+largest storage takes 4 GB of disk or memory. The example samples four batches of
+transitions at once, which is timed too. With ``--device=cuda`` there are storages
 on the GPU too; samples of the others are moved there before all transforms.
 
 A ratio is to the same sample without the transform, all timed in turns. One ratio has
@@ -216,13 +217,17 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def bench_transitions(
     benchmark: Any, judge: Any, rows: str, kind: str, folder: Path, device: torch.device
 ) -> None:
-    """512 transitions, 3 entities."""
+    """512 transitions, 3 entities; and four such batches in one sample."""
     setting = made(TRANSITIONS, 512, rows, kind, folder, device)
     calls = setting.calls()
-    times = seconds(calls, rounds=600, warmup=20)
-    for name, target in (("swap", 1.6), ("goals", 2.2), ("donors", 1.6)):
-        label = f"512 transitions, {LABELS[name]} / plain, {rows} {kind}"
-        judge(label, times[name] / times["plain"], at_most=target)
+    for what, some, rounds in (
+        ("512", calls, 600),
+        ("4 x 512", replace(setting, windows=4 * 512).calls(), 150),
+    ):
+        times = seconds(some, rounds=rounds, warmup=20)
+        for name, target in (("swap", 1.6), ("goals", 2.2), ("donors", 1.6)):
+            label = f"{what} transitions, {LABELS[name]} / plain, {rows} {kind}"
+            judge(label, times[name] / times["plain"], at_most=target)
     benchmark.pedantic(calls["swap"], rounds=50)
 
 
