@@ -3,7 +3,7 @@
 Its tensors say that they lie on ``cuda:0`` and keep their values on the CPU. An
 operation raises where its operands lie on two devices, and within
 :func:`nothing_waits` where the host would wait for the device, as a CUDA device does.
-What it cannot do: gradients, recurrent layers, and to be as fast.
+What it cannot do: gradients, compiled kernels, and to be as fast.
 """
 
 from __future__ import annotations
@@ -58,6 +58,7 @@ def pretend_cuda() -> Iterator[None]:
             mock.patch("torch.cuda._lazy_init"),
             mock.patch("torch.cuda.current_device", return_value=0),
             mock.patch("torch.cuda.synchronize"),
+            torch.backends.cudnn.flags(enabled=False),
             _MadeOnCuda(),
         ):
             yield
@@ -136,13 +137,32 @@ def _computed(func: Any, args: Any, kwargs: Any) -> Any:
         waits = on_cuda and (masks or name in LOOKS)
     if waits and _must_not_wait:
         raise RuntimeError(f"{name} waits for the device")
+    if to_cuda and isinstance(kwargs.get("generator"), torch.Generator):
+        raise RuntimeError(f"{name} expected a generator of a CUDA device")
     if kwargs.get("pin_memory"):
         kwargs = {**kwargs, "pin_memory": False}
+    if name == "_thnn_fused_lstm_cell":
+        func = _lstm_cell
     plain_args, plain_kwargs = tree_map_only(OnCuda, lambda x: x.values, (args, kwargs))
     out = func(*plain_args, **plain_kwargs)
     if to_cuda:
         out = tree_map_only(torch.Tensor, OnCuda, out)
-    return return_and_correct_aliasing(func, args, kwargs, out) if on_cuda else out
+    if func is _lstm_cell or not on_cuda:
+        return out
+    return return_and_correct_aliasing(func, args, kwargs, out)
+
+
+def _lstm_cell(
+    of_input: torch.Tensor,
+    of_hidden: torch.Tensor,
+    cell: torch.Tensor,
+    *biases: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    # What CUDA devices have a kernel for, and CPUs have not.
+    gates = of_input + of_hidden + sum(biases)
+    enter, forget, new, leave = gates.chunk(4, -1)
+    cell = forget.sigmoid() * cell + enter.sigmoid() * new.tanh()
+    return leave.sigmoid() * cell.tanh(), cell, gates
 
 
 def _check_devices(name: str, operands: list[torch.Tensor]) -> None:

@@ -43,6 +43,11 @@ def test_operands_lie_on_one_device(mix: Callable[[Any], Any], x: torch.Tensor) 
         mix(x)
 
 
+def test_generators_draw_on_their_own_device() -> None:
+    with pytest.raises(RuntimeError, match="generator"):
+        torch.rand(3, generator=torch.Generator(), device="cuda")
+
+
 @pytest.mark.parametrize(
     "look",
     [

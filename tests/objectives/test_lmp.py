@@ -369,3 +369,13 @@ def test_learns_which_actions_lead_to_which_goal(decoder):
     wrong = (actions.unsqueeze(1) - table).square().mean((-2, -1)).argmin(1) != which
     assert error < 0.15
     assert not wrong.any()
+
+
+@pytest.mark.gpu
+def test_losses_of_a_gpu_are_those_of_the_cpu():
+    batch, found = make_batch(8), []
+    for device in ("cpu", "cuda"):
+        losses = make_loss(make_model().to(device))(batch.to(device))
+        assert all(value.device.type == device for value in losses.values())
+        found.append(losses.detach().cpu())
+    torch.testing.assert_close(found[1].to_dict(), found[0].to_dict())

@@ -16,6 +16,7 @@ from torchrl_caiac.modules.lmp import (
     plan_is_sampled,
     read_leaf,
 )
+from torchrl_caiac.random_numbers import draw_numbers
 
 __all__ = ["LMPActor"]
 
@@ -169,8 +170,12 @@ class LMPActor(TensorDictModuleBase):
         """
         if not plan_is_sampled(self.sample):
             return None
-        return torch.randn(
-            loc.shape, generator=self.generator, dtype=loc.dtype, device=loc.device
+        return draw_numbers(
+            torch.randn,
+            loc.shape,
+            generator=self.generator,
+            dtype=loc.dtype,
+            device=loc.device,
         )
 
     def make_tensordict_primer(self) -> TensorDictPrimer:

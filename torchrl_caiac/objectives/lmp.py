@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_caiac.modules.lmp import LMPModel, gaussian_plan, read_leaf
+from torchrl_caiac.random_numbers import draw_numbers
 
 __all__ = ["LMPLoss", "balanced_kl", "gaussian_kl"]
 
@@ -274,7 +275,8 @@ class LMPLoss(LossModule):
 
         # Losses run in deterministic exploration mode, so the sample is drawn here
         # and not left to a probabilistic module.
-        noise = torch.randn(
+        noise = draw_numbers(
+            torch.randn,
             loc_q.shape,
             generator=self.generator,
             dtype=loc_q.dtype,

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 
+from torchrl_caiac.random_numbers import draw_numbers
 from torchrl_caiac.transforms.donors import (
     _CHUNK,
     _RANDOM_BITS,
@@ -18,7 +19,6 @@ from torchrl_caiac.transforms.donors import (
     SwapDraw,
     TrajectoryIndex,
     _pick,
-    _rand,
     _scan,
     _window_max,
 )
@@ -160,9 +160,11 @@ def _shared(
     leader, device = _leader(masks), masks.device
     wanted = masks != 0
     if swap_prob < 1.0:
-        chance = _rand(torch.rand, masks.shape, device=device, generator=generator)
+        chance = draw_numbers(
+            torch.rand, masks.shape, device=device, generator=generator
+        )
         wanted = wanted & (chance < swap_prob).gather(1, leader)
-    pick = _rand(
+    pick = draw_numbers(
         torch.randint, _RANDOM_BITS, masks.shape, device=device, generator=generator
     )
     return leader, pick.gather(1, leader), wanted

@@ -21,6 +21,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac.entities import EntityLayout, _flatten
+from torchrl_caiac.random_numbers import draw_numbers
 
 __all__ = [
     "BufferDonors",
@@ -151,26 +152,14 @@ def _window_max(scores: torch.Tensor, window: int) -> torch.Tensor:
     return scores.unflatten(0, (-1, window)).transpose(0, 1).contiguous().amax(0)
 
 
-def _rand(
-    kind: Callable[..., torch.Tensor],
-    *args: Any,
-    device: torch.device,
-    generator: torch.Generator | None,
-) -> torch.Tensor:
-    # A generator draws on its own device only; from pinned memory, what it drew is
-    # copied without waiting for the accelerator.
-    source = device if generator is None else generator.device
-    pinned = source.type == "cpu" and device.type == "cuda"
-    drawn = kind(*args, generator=generator, device=source, pin_memory=pinned)
-    return drawn.to(device, non_blocking=pinned)
-
-
 def _wanted(
     free: torch.Tensor, swap_prob: float, generator: torch.Generator | None
 ) -> torch.Tensor:
     if swap_prob >= 1.0:
         return free
-    chance = _rand(torch.rand, free.shape, device=free.device, generator=generator)
+    chance = draw_numbers(
+        torch.rand, free.shape, device=free.device, generator=generator
+    )
     return free & (chance < swap_prob)
 
 
@@ -223,7 +212,7 @@ def draw_batch_donors(
     total, own = rank[:, -1:], rank[:, first:]
     # At least two, of which a remainder can be taken: with fewer there is no donor.
     size = total.clamp_min(2)
-    pick = _rand(
+    pick = draw_numbers(
         torch.randint, _RANDOM_BITS, own.shape, device=free.device, generator=generator
     )
     # Round the circle of free windows from the one behind the own, never back to it.
@@ -271,7 +260,7 @@ def draw_buffer_donors(
     device = free.device
     wanted = _wanted(free, swap_prob, generator)
     size = index.size.to(device)
-    pick = _rand(
+    pick = draw_numbers(
         torch.randint, _RANDOM_BITS, free.shape, device=device, generator=generator
     )
     pick = (pick % size.clamp_min(1) + index.offset.to(device)).clamp_max_(

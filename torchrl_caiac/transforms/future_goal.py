@@ -14,13 +14,13 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl.envs.transforms import Transform
 
 from torchrl_caiac.entities import EntityLayout, _path
+from torchrl_caiac.random_numbers import draw_numbers
 from torchrl_caiac.transforms.donors import (
     _RANDOM_BITS,
     StorageCache,
     TrajectoryIndex,
     _pick,
     _plain,
-    _rand,
     _take,
     goal_columns,
     trajectory_index,
@@ -67,12 +67,14 @@ def draw_goal_offset(
     device, offset = remaining.device, remaining
     chance = None
     if len(weights) > 1:
-        chance = _rand(torch.rand, remaining.shape, device=device, generator=generator)
+        chance = draw_numbers(
+            torch.rand, remaining.shape, device=device, generator=generator
+        )
     below, total = 0.0, sum(weights.values())
     for name, weight in weights.items():
         drawn = remaining
         if name == "uniform":
-            drawn = _rand(
+            drawn = draw_numbers(
                 torch.randint,
                 _RANDOM_BITS,
                 remaining.shape,
@@ -105,7 +107,7 @@ def _geometric(
 
     if p >= 1.0:
         return torch.zeros(shape, dtype=torch.int64, device=device)
-    return _rand(draw, device=device, generator=generator)
+    return draw_numbers(draw, device=device, generator=generator)
 
 
 class FutureGoal(Transform, SampleUnit):

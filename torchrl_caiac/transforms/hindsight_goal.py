@@ -11,11 +11,11 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.random_numbers import draw_numbers
 from torchrl_caiac.transforms.donors import (
     RewardFn,
     _number,
     _pick,
-    _rand,
     _storage_td,
     call_reward,
     stored_reward,
@@ -245,7 +245,7 @@ class HindsightGoal(FutureGoal):
         generator = self.generator if generator is None else generator
         marks = counterfactual.reshape(-1)
         rows, device = marks.shape[0], marks.device
-        chance, pick = _rand(
+        chance, pick = draw_numbers(
             torch.rand, (2, rows), device=device, generator=generator
         ).double()
         own = torch.arange(rows, device=device)
