@@ -28,6 +28,7 @@ ROOMS = sorted(
         f"torchrl_caiac.{module.name}"
         for module in pkgutil.iter_modules(torchrl_caiac.__path__)
         if module.name != "entities"  # the package's own names
+        and not module.name.startswith("_")
     ]
 )
 PUBLIC = [

@@ -10,13 +10,13 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
+from torchrl_caiac._random_numbers import draw_numbers
 from torchrl_caiac.modules.lmp import (
     LMPModel,
     gaussian_plan,
     plan_is_sampled,
     read_leaf,
 )
-from torchrl_caiac.random_numbers import draw_numbers
 
 __all__ = ["LMPActor"]
 

@@ -12,8 +12,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from torchrl_caiac._random_numbers import draw_numbers
 from torchrl_caiac.modules.lmp import LMPModel, gaussian_plan, read_leaf
-from torchrl_caiac.random_numbers import draw_numbers
 
 __all__ = ["LMPLoss", "balanced_kl", "gaussian_kl"]
 

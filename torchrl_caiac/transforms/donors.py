@@ -20,8 +20,8 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from torchrl_caiac._random_numbers import draw_numbers
 from torchrl_caiac.entities import EntityLayout, _flatten
-from torchrl_caiac.random_numbers import draw_numbers
 
 __all__ = [
     "BufferDonors",
