@@ -34,19 +34,22 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """One thread, denormals flushed: what the scripts do.
-
-    What earlier benchmarks have left is no garbage to search during this one.
-    """
+    """One thread, denormals flushed: what the scripts do."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
+    yield
+    torch.set_flush_denormal(False)
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True)
+def no_old_objects() -> Iterator[None]:
+    """Spares the garbage collector what earlier benchmarks have left."""
     gc.collect()
     gc.freeze()
     yield
     gc.unfreeze()
-    torch.set_flush_denormal(False)
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture

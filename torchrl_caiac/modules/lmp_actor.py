@@ -46,7 +46,8 @@ class LMPActor(TensorDictModuleBase):
 
     Keyword Args:
         sample: whether plans are drawn where no exploration type is set.
-        generator: source of the plans' noise; the global one by default.
+        generator: source of the plans' noise, of any device; the global one by
+            default.
         observation_key: leaf of the states; the model's by default.
         goal_key: leaf of the goals; the model's by default.
         action_key: leaf where the action is written; the model's by default.

@@ -111,7 +111,8 @@ class LMPLoss(LossModule):
     Keyword Args:
         reduction: ``"mean"`` or ``"sum"`` over windows, or ``"none"``, which gives
             ``[*B]``.
-        generator: source of the plans' noise; the global one by default.
+        generator: source of the plans' noise, of any device; the global one by
+            default.
 
     Raises:
         ValueError: if a weight, the balance or the reduction is out of range.
