@@ -8,18 +8,16 @@ from __future__ import annotations
 import csv
 import json
 import math
-import multiprocessing
 import os
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from contextlib import contextmanager
-from itertools import islice
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torchrl.checkpoint import Checkpoint, GlobalRNGState, StateDictCheckpointAdapter
+
+from torchrl_caiac._files import claim_folder, plain, whole_file, write_json
+from torchrl_caiac._processes import bar_position, end_with_parent
+from torchrl_caiac._processes import run_in_processes as run_side_by_side
 
 __all__ = [
     "TrainingCheckpoint",
@@ -33,94 +31,6 @@ __all__ = [
     "whole_file",
     "write_json",
 ]
-
-_POSITION = "TQDM_POSITION"
-
-
-@contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Gives a file to write, which takes its place when all is written.
-
-    The folder is made where it is missing. What raises leaves the old file as it was.
-
-    Args:
-        path (path): the file that is wanted.
-
-    Yields:
-        Path: a file beside it with the same suffix.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac.experiments import whole_file
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with whole_file(f"{folder}/results/table.txt") as partial:
-        ...         _ = partial.write_text("42")
-        ...     open(f"{folder}/results/table.txt").read()
-        '42'
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
-    try:
-        yield partial
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-@contextmanager
-def claim_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Keeps every other process that claims a folder out of it.
-
-    A process that ends, in whatever way, gives its folders up.
-
-    Args:
-        folder (path): made where it is missing; gets a file ``.lock``.
-
-    Raises:
-        RuntimeError: another process has claimed the folder.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac.experiments import claim_folder
-        >>> with tempfile.TemporaryDirectory() as folder, claim_folder(folder):
-        ...     pass  # this process alone writes its results
-    """
-    from filelock import FileLock, Timeout  # torch needs it too
-
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise RuntimeError(
-            f"another process works in {folder}: wait for it, end it, or give another "
-            "folder with out=..."
-        ) from None
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Writes a value as JSON, whole or not at all.
-
-    Args:
-        path (path): the file, replaced where it exists.
-        value (Any): mappings, sequences, strings, numbers, booleans and ``None``.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac.experiments import write_json
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_json(f"{folder}/a.json", {"b": (1, 2)})
-        ...     json.load(open(f"{folder}/a.json"))
-        {'b': [1, 2]}
-    """
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(_plain(value), indent=1) + "\n")
 
 
 def update_csv(
@@ -250,7 +160,7 @@ def keep_settings(settings: Mapping[str, Any], path: str | os.PathLike[str]) -> 
             "one with out=..."
         ) from error
     # Through JSON, so that tuples and lists are the same.
-    wanted = json.loads(json.dumps(_plain(settings)))
+    wanted = json.loads(json.dumps(plain(settings)))
     if kept != wanted:
         differ: Any = "all"
         if isinstance(kept, dict):
@@ -260,14 +170,6 @@ def keep_settings(settings: Mapping[str, Any], path: str | os.PathLike[str]) -> 
             f"{path.parent} holds results of other settings, see {path} ({differ} "
             "differ): delete the folder, or give another one with out=..."
         )
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(value[key]) for key in value}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(item) for item in value]
-    return value
 
 
 class TrainingCheckpoint:
@@ -333,111 +235,3 @@ class TrainingCheckpoint:
                 f"{self.path} is no readable checkpoint of this training, it may be "
                 f"truncated or foreign ({error}): delete it to begin anew"
             ) from error
-
-
-def bar_position() -> int:
-    """The line of this process's progress bars, among runs side by side.
-
-    Returns:
-        int: ``position=`` for ``tqdm``; 0 outside of :func:`run_side_by_side`.
-
-    Examples:
-        >>> from torchrl_caiac.experiments import bar_position
-        >>> bar_position()
-        0
-    """
-    return int(os.environ.get(_POSITION, "0"))
-
-
-def run_side_by_side(
-    function: Callable[..., Any],
-    jobs: Iterable[tuple[Any, ...]],
-    *,
-    processes: int = 2,
-) -> Iterator[tuple[int, Any]]:
-    """Runs jobs in processes of their own, in which torch has one thread.
-
-    Jobs start in their order, and the next one when one has finished. When one raises,
-    those not yet begun are left out and the error is raised when the running ones have
-    ended. The processes end with this one, however it ends.
-
-    Args:
-        function (Callable): what a job does; picklable, as its results are.
-        jobs (iterable of tuples): the arguments of each job.
-
-    Keyword Args:
-        processes (int): how many at a time. Defaults to 2.
-
-    Yields:
-        tuple[int, Any]: the number of a finished job and its result, in the order in
-        which they finish.
-
-    Examples:
-        >>> from math import hypot
-        >>> from torchrl_caiac.experiments import run_side_by_side
-        >>> dict(run_side_by_side(hypot, [(3, 4), (5, 12)], processes=1))
-        {0: 5.0, 1: 13.0}
-    """
-    if processes < 1:
-        raise ValueError(f"processes is {processes}, wanted at least 1")
-    # spawn: forked copies of torch's and OpenGL's threads may hang.
-    context = multiprocessing.get_context("spawn")
-    counter = context.Value("i", 0)
-    pool = ProcessPoolExecutor(
-        processes,
-        mp_context=context,
-        initializer=_start_worker,
-        initargs=(counter,),
-    )
-    waiting = enumerate(jobs)
-    running: dict[Any, int] = {}
-
-    def start(count: int) -> None:
-        # No more than there are processes: the pool cannot take a job back that it has
-        # put aside for the next free process.
-        for number, job in islice(waiting, count):
-            running[pool.submit(_on_one_thread, function, job)] = number
-
-    try:
-        start(processes)
-        while running:
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            finished = [(running.pop(future), future.result()) for future in done]
-            start(len(finished))
-            yield from sorted(finished)
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def end_with_parent() -> None:
-    """Lets this process end as soon as the one that started it has ended.
-
-    Called in a process of ``multiprocessing``: when its parent is killed it would wait
-    for work for ever, or go on writing beside the parent's successor.
-
-    Examples:
-        >>> from torchrl_caiac.experiments import end_with_parent
-        >>> end_with_parent()  # nothing, in a process that was not started so
-    """
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)  # at once: the main thread may be in the middle of a long job
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _on_one_thread(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
-    # Before every job: the one before may have left more, as TorchRL's environments do.
-    torch.set_num_threads(1)
-    return function(*job)
-
-
-def _start_worker(counter: Any) -> None:
-    end_with_parent()
-    with counter.get_lock():
-        os.environ[_POSITION] = str(counter.value)
-        counter.value += 1

@@ -676,7 +676,7 @@ def test_observations_that_are_not_finite():
 def test_bad_buffers():
     with pytest.raises(TypeError, match="scores a ReplayBuffer, got TensorDict"):
         score_buffer(episodes([3]), Read())
-    with pytest.raises(ValueError, match="the buffer is empty"):
+    with pytest.raises(ValueError, match="storage is empty"):
         score_buffer(ReplayBuffer(storage=LazyTensorStorage(3)), Read())
     with pytest.raises(TypeError, match="ListStorage"):
         score_buffer(ReplayBuffer(storage=ListStorage(3)), Read())

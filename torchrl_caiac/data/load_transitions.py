@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict._utils_key_json import _encode_key_for_filesystem
+from tensordict import TensorDict
 from tensordict.utils import NestedKey
+
+from torchrl_caiac._torchrl import file_name, mark_memmap
 
 __all__ = ["load_transitions"]
 
@@ -75,11 +76,7 @@ def load_transitions(
             f"{path} lacks {missing}, it has {found}: it holds something else, or was "
             "made with other keys"
         )
-    # Loaded, a tensordict has mapped leaves but does not know it. `memmap_` would tell
-    # it, and write the folder's meta.json anew while other processes may read it.
-    nodes = (v for v in data.values(True) if isinstance(v, TensorDictBase))
-    for node in (data, *nodes):
-        node._is_memmap = True
+    mark_memmap(data)
     return data.lock_()
 
 
@@ -102,7 +99,7 @@ def _check_folder(folder: Path, root: Path) -> list[int]:
     for key, entry in content.items():
         if not isinstance(entry, dict):
             continue
-        name = _encode_key_for_filesystem(key)
+        name = file_name(key)
         if entry.get("type") is not None:
             if entry["type"] == "TensorDict":
                 _check_folder(folder / name, root)

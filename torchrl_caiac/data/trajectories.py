@@ -7,6 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 
+from torchrl_caiac._torchrl import last_written
+
 __all__ = ["TrajectoryEnds", "newest_row"]
 
 
@@ -30,14 +32,7 @@ def newest_row(rb: ReplayBuffer) -> int | None:
         >>> newest_row(rb)
         2
     """
-    # A buffer that was loaded from disk has the writer's cursor only.
-    newest = getattr(rb.storage, "_last_cursor_index", None)
-    if newest is not None:
-        return int(newest)
-    cursor = getattr(rb.writer, "_cursor", None)
-    if cursor is None or not len(rb):
-        return None
-    return (int(cursor) - 1) % len(rb)
+    return last_written(rb)
 
 
 class TrajectoryEnds:

@@ -13,13 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import nn
 from torchrl.data import ReplayBuffer, TensorStorage
 from torchrl.envs.transforms import Transform
 from tqdm.auto import tqdm
 
+from torchrl_caiac._torchrl import (
+    add_revision,
+    drop_memmap_leaf,
+    drop_prefetched,
+    forget_leaves,
+    known_to_be_memmap,
+    memmap_folder,
+    storage_data,
+)
 from torchrl_caiac.data.trajectories import TrajectoryEnds, newest_row
 from torchrl_caiac.entities import EntityLayout, _path
 
@@ -311,10 +320,9 @@ def score_buffer(
             scores = scorer.chunk(c)
             leaf[scorer.span(c)] = scores.to(leaf.device)
             bar.update(len(scores))
-    storage._bump_mutation_revision()
+    add_revision(storage)
     # Samples drawn ahead lack the leaf, or hold it unscored.
-    with rb._futures_lock:
-        rb._clear_prefetch_queue_locked()
+    drop_prefetched(rb)
 
 
 class _Scorer:
@@ -556,31 +564,13 @@ def _open(rb: ReplayBuffer) -> tuple[TensorStorage, TensorDictBase]:
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     storage = rb.storage
-    if not isinstance(storage, TensorStorage):
-        raise TypeError(
-            f"the storage, a {type(storage).__name__}, has no tensordict of all rows: "
-            "use LazyTensorStorage, LazyMemmapStorage or TensorStorage"
-        )
-    if not len(storage):
-        raise ValueError("the buffer is empty: extend it before scoring")
+    data = storage_data(storage)
     if storage.ndim != 1:
         raise ValueError(
             f"the storage has ndim={storage.ndim}, wanted 1: store flat transitions, "
             "with trajectory ids"
         )
-    data = storage._storage
-    if not isinstance(data, TensorDictBase):
-        raise TypeError(
-            f"the storage holds a {type(data).__name__}, wanted a TensorDict: extend "
-            "the buffer with tensordicts"
-        )
-    prefix = getattr(data, "_memmap_prefix", None)
-    if prefix is not None and not data.is_memmap():
-        # A tensordict that was loaded from a folder has memory-mapped leaves but does
-        # not know it; this maps it in place and copies nothing.
-        leaves = data.values(include_nested=True, leaves_only=True)
-        if all(isinstance(leaf, MemoryMappedTensor) for leaf in leaves):
-            data.memmap_(prefix)
+    known_to_be_memmap(data)
     return storage, data
 
 
@@ -647,8 +637,7 @@ def _new_leaf(
             leaf = data.get(key)
     leaf.fill_(torch.nan)
     # The storage filters what is written by its list of keys, made before.
-    storage._storage_keys = None
-    storage._bump_mutation_revision()
+    forget_leaves(storage)
     return leaf
 
 
@@ -661,7 +650,7 @@ def _remove_leaf(data: TensorDictBase, key: NestedKey) -> None:
         return
     # A memmap tensordict has no way to drop a leaf, and unlocked it would stop being
     # one: it is taken out of the folder's list of leaves, the file, and the mapping.
-    prefix = getattr(node, "_memmap_prefix", None)
+    prefix = memmap_folder(node)
     if prefix is not None:
         meta = Path(prefix) / "meta.json"
         content = json.loads(meta.read_text(encoding="utf-8"))
@@ -670,9 +659,7 @@ def _remove_leaf(data: TensorDictBase, key: NestedKey) -> None:
     filename = getattr(node.get(path[-1]), "filename", None)
     if filename:
         Path(filename).unlink(missing_ok=True)
-    node._tensordict.pop(path[-1])
-    data._erase_cache()
-    node._erase_cache()
+    drop_memmap_leaf(data, key)
 
 
 def _mark_later_rows(
@@ -691,9 +678,9 @@ def _mark_later_rows(
 def _read_record(
     storage: TensorStorage, data: TensorDictBase, key: NestedKey
 ) -> dict[str, Any] | None:
-    prefix = getattr(data, "_memmap_prefix", None)
+    prefix = memmap_folder(data)
     if prefix is None or not data.is_memmap():
-        return getattr(storage, "_caiac_scores", {}).get(key)
+        return getattr(storage, "caiac_scores", {}).get(key)
     path = score_file(prefix, key)
     if not path.exists():
         return None
@@ -738,10 +725,10 @@ def _write_record(
         "fingerprint": _sha(json.dumps(settings, sort_keys=True)),
         "settings": settings,
     }
-    prefix = getattr(data, "_memmap_prefix", None)
+    prefix = memmap_folder(data)
     if prefix is None or not data.is_memmap():
-        records = getattr(storage, "_caiac_scores", {})
-        storage._caiac_scores = {**records, key: record}
+        records = getattr(storage, "caiac_scores", {})
+        storage.caiac_scores = {**records, key: record}
     else:
         _write_json(score_file(prefix, key), record)
 

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torch.nn.utils import parametrizations
 
+from torchrl_caiac._torchrl import linear_pointwise, packed_weight
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
@@ -340,11 +341,10 @@ def _product(
     ):
         # oneDNN, as torch.compile calls it. F.linear takes MKL for float32, which is
         # half as fast on processors that are not Intel's.
-        weight = torch.ops.mkldnn._reorder_linear_weight(weight.detach())
-        after = "relu" if relu else "none"
+        weight = packed_weight(weight.detach())
 
         def product(x: torch.Tensor) -> torch.Tensor:
-            return torch.ops.mkldnn._linear_pointwise(x, weight, bias, after, [], "")
+            return linear_pointwise(x, weight, bias, relu)
 
     else:
 

@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrl_caiac._torchrl import linear_pointwise
+
 __all__ = ["linear"]
 
 # Multiply-adds below which the larger overhead of a call outweighs the quicker kernel.
@@ -63,11 +65,7 @@ class _Linear(torch.autograd.Function):
     def forward(
         value: Tensor, weight: Tensor, bias: Tensor | None, relu: bool
     ) -> Tensor:
-        # What torch.compile makes of F.linear; torch has no public name for it.
-        product = torch.ops.mkldnn._linear_pointwise
-        after = "relu" if relu else "none"
-        out: Tensor = product(value, weight, bias, after, [], "")
-        return out
+        return linear_pointwise(value, weight, bias, relu)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

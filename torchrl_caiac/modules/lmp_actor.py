@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from torchrl_caiac._random_numbers import draw_numbers
+from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.modules.lmp import (
     LMPModel,
     gaussian_plan,

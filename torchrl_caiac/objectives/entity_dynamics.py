@@ -12,6 +12,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
+from torchrl_caiac._torchrl import reduce_loss
 from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
     evaluating,
@@ -154,10 +155,10 @@ class EntityDynamicsLoss(LossModule):
         error = (target - prediction[0].detach()).square().mean(-1)
         out = TensorDict(
             {
-                "loss_nll": self._reduce_loss(
-                    model.nll(prediction, target), tensordict
+                "loss_nll": reduce_loss(
+                    self, model.nll(prediction, target), tensordict
                 ),
-                "mse": self._reduce_loss(error, tensordict),
+                "mse": reduce_loss(self, error, tensordict),
             }
         )
         if self.reduction == "none":

@@ -12,8 +12,9 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.objectives import TD3Loss
-from torchrl.objectives.utils import _vmap_func, distance_loss
+from torchrl.objectives.utils import distance_loss
 
+from torchrl_caiac._torchrl import priority_weight, reduce_loss, vmap_loss
 from torchrl_caiac.modules.goal_features import read
 from torchrl_caiac.modules.goal_networks import takes_params
 
@@ -300,7 +301,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             tuple: the loss, and detached ``"state_action_value_actor"`` ``[*B]`` and,
             with ``bc_alpha``, the scalars ``"bc_loss"`` and ``"lmbd"``.
         """
-        weights = self._maybe_get_priority_weight(tensordict)
+        weights = priority_weight(self, tensordict)
         inputs = self._inputs(tensordict, self._state_keys)
         inputs = _call(self.actor_network, inputs, self.actor_network_params)
         action = inputs.get(self.tensor_keys.action)
@@ -311,16 +312,16 @@ class GoalConditionedTD3Loss(TD3Loss):
         metadata = {"state_action_value_actor": value.detach()}
         loss = -value
         if self.bc_alpha is not None:
-            size = self._reduce_loss(value.detach().abs(), tensordict, reduction="mean")
+            size = reduce_loss(self, value.detach().abs(), tensordict, reduction="mean")
             metadata["lmbd"] = self.bc_alpha / size.clamp_min(1e-8)
             error = self._cloning_error(action, tensordict)
-            metadata["bc_loss"] = self._reduce_loss(
-                error.detach(), tensordict, reduction="mean"
+            metadata["bc_loss"] = reduce_loss(
+                self, error.detach(), tensordict, reduction="mean"
             )
             loss = metadata["lmbd"] * loss + error
         if self.action_penalty:
             loss = loss + self.action_penalty * action.square().mean(-1)
-        loss = self._reduce_loss(loss, tensordict, weights=weights)
+        loss = reduce_loss(self, loss, tensordict, weights=weights)
         return loss, metadata
 
     def value_loss(
@@ -336,7 +337,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             ``[C, *B]``, ``"next_state_value"`` and ``"target_value"`` ``[*B]``.
         """
         keys = self.tensor_keys
-        weights = self._maybe_get_priority_weight(tensordict)
+        weights = priority_weight(self, tensordict)
         inputs = self._inputs(tensordict, [*self._state_keys, keys.action])
         action = inputs.get(keys.action)
         noise = (torch.randn_like(action) * self.policy_noise).clamp(
@@ -361,13 +362,13 @@ class GoalConditionedTD3Loss(TD3Loss):
             "pred_value": value.detach(),
             "target_value": target,
         }
-        loss = self._reduce_loss(loss, tensordict, weights=weights)
+        loss = reduce_loss(self, loss, tensordict, weights=weights)
         return loss, metadata
 
     def _make_vmap(self) -> None:
         super()._make_vmap()
         # The critics share their input, so that only their weights are mapped over.
-        self._vmap_qvalue_networkN0 = _vmap_func(
+        self._vmap_qvalue_networkN0 = vmap_loss(
             self.qvalue_network,
             (None, 0),
             randomness=self.vmap_randomness,

@@ -12,7 +12,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
-from torchrl_caiac._random_numbers import draw_numbers
+from torchrl_caiac._random import draw_numbers
+from torchrl_caiac._torchrl import loss_masks
 from torchrl_caiac.modules.lmp import LMPModel, gaussian_plan, read_leaf
 
 __all__ = ["LMPLoss", "balanced_kl", "gaussian_kl"]
@@ -357,7 +358,7 @@ class LMPLoss(LossModule):
 
     def _read_mask(self, tensordict: TensorDictBase, rows: torch.Size) -> Tensor | None:
         found: Tensor | None = None
-        for key in (self.tensor_keys.mask, *self._loss_mask_keys()):
+        for key in (self.tensor_keys.mask, *loss_masks(self)):
             mask = tensordict.get(key, None)
             if mask is None:
                 continue

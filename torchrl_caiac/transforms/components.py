@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 
-from torchrl_caiac._random_numbers import draw_numbers
+from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.transforms.donors import (
     _CHUNK,
     _RANDOM_BITS,

@@ -16,11 +16,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from tensordict import TensorDictBase, is_tensor_collection
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
-from torchrl_caiac._random_numbers import draw_numbers
+from torchrl_caiac._random import draw_numbers
+from torchrl_caiac._torchrl import last_written, storage_data, storage_revision
 from torchrl_caiac.entities import EntityLayout, _flatten
 
 __all__ = [
@@ -293,21 +294,7 @@ def _storage_td(storage: Any, what: str) -> TensorDictBase:
             f"LazyMemmapStorage, ...), got {type(storage).__name__} with ndim "
             f"{getattr(storage, 'ndim', None)}"
         )
-    if not storage.initialized or len(storage) == 0:
-        raise ValueError(f"{what} is empty: extend it with data before sampling")
-    data = storage._storage
-    if not is_tensor_collection(data):
-        raise TypeError(f"{what} holds a {type(data).__name__}, wanted a TensorDict")
-    return data
-
-
-def storage_revision(storage: TensorStorage) -> tuple[Any, ...]:
-    """A value that changes whenever the storage is written to."""
-    return (
-        int(storage._mutation_revision),
-        len(storage),
-        storage._last_cursor_index,
-    )
+    return storage_data(storage, what)
 
 
 def trajectory_index(
@@ -356,7 +343,7 @@ def trajectory_index(
             f"flags in {done_key!r}, so windows cannot be told apart: name the leaf "
             "that it has by trajectory_key"
         )
-    cursor = storage._last_cursor_index
+    cursor = last_written(storage)
     full = length == storage.max_size
     oldest = (int(cursor) + 1) % length if full and cursor is not None else 0
     leaf = _plain(leaf)[:length].reshape(length)

@@ -13,7 +13,7 @@ from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers import SampleUnit
 from torchrl.envs.transforms import Transform
 
-from torchrl_caiac._random_numbers import draw_numbers
+from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.entities import EntityLayout, _path
 from torchrl_caiac.transforms.donors import (
     _RANDOM_BITS,

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 
-from torchrl_caiac._random_numbers import draw_numbers
+from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.donors import (
     RewardFn,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.pretend_cuda import nothing_waits
-from torchrl_caiac._random_numbers import draw_numbers
+from torchrl_caiac._random import draw_numbers
 
 KINDS: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]] = [
     (torch.rand, ((2, 3),), {"dtype": torch.float64}),

@@ -37,7 +37,7 @@ def draw_numbers(
 
     Examples:
         >>> import torch
-        >>> from torchrl_caiac._random_numbers import draw_numbers
+        >>> from torchrl_caiac._random import draw_numbers
         >>> generator = torch.Generator().manual_seed(0)
         >>> cpu = torch.device("cpu")
         >>> draw_numbers(torch.randint, 9, (3,), device=cpu, generator=generator)

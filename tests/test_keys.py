@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_caiac._keys import as_key, get_leaf, missing_key
+
+
+def test_no_key():
+    with pytest.raises(TypeError, match="a str or a tuple of str, got 3"):
+        as_key(3)
+
+
+def test_get_leaf_names_what_is_there_and_what_to_do():
+    td = TensorDict({"a": torch.zeros(2), "next": {"b": torch.ones(2)}}, [2])
+    assert get_leaf(td, ("next", "b"), "the data lack", "add it").sum() == 2
+    with pytest.raises(KeyError, match=r"the data lack .*c.*; they have .*a.*: add it"):
+        get_leaf(td, "c", "the data lack", "add it")
+    with pytest.raises(TypeError, match="'next' is a TensorDict, wanted a tensor"):
+        get_leaf(td, "next", "the data lack", "add it")
+    error = missing_key(td, ["x", "y"], "lack", "add them")
+    assert error.args[0].startswith("lack 'x' and 'y'; they have")

@@ -1,0 +1,242 @@
+"""The one module that touches private names of torch, torchrl and tensordict."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict
+from torchrl.data import (
+    ImmutableDatasetWriter,
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ListStorage,
+    ReplayBuffer,
+    TensorStorage,
+)
+from torchrl.objectives import LossModule
+
+import torchrl_caiac
+from torchrl_caiac import _torchrl as fence
+
+PACKAGE = Path(torchrl_caiac.__file__).parent
+FOREIGN = {"torch", "torchrl", "tensordict"}
+# Methods that TorchRL's documentation tells subclasses to write, and dunder-like names.
+HOOKS = {"_AcceptedKeys", "_call", "_inv_call", "_step", "_reset", "_set_seed"}
+
+
+def private(name):
+    return name.startswith("_") and not name.endswith("__")
+
+
+def own_names(trees):
+    """Every private name that the package defines itself."""
+    names = set(HOOKS)
+    for tree in trees:
+        for node in ast.walk(tree):
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+                names.add(node.name)
+            elif isinstance(node, (ast.Name, ast.Attribute)):
+                is_self = isinstance(node, ast.Attribute) and not (
+                    isinstance(node.value, ast.Name)
+                    and node.value.id in ("self", "cls", "clone")
+                )
+                if isinstance(node.ctx, ast.Store) and not is_self:
+                    names.add(getattr(node, "id", None) or node.attr)
+    return names
+
+
+def touched(tree, own):
+    """Private names of others, by attribute, by getattr and by import."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            if private(node.attr) and node.attr not in own:
+                yield ast.unparse(node)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            parts = node.module.split(".")
+            names = [*parts, *(alias.name for alias in node.names)]
+            if parts[0] in FOREIGN and any(map(private, names)):
+                yield ast.unparse(node)
+        elif (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id in ("getattr", "setattr", "hasattr")
+            and isinstance(node.args[1], ast.Constant)
+            and private(node.args[1].value)
+            and node.args[1].value not in own
+        ):
+            yield ast.unparse(node)
+
+
+# Of gymnasium-robotics and of Python.
+ALLOWED = {
+    "os._exit",
+    "robot._ctrl_position_limits",
+    "robot._ctrl_velocity_limits",
+}
+
+
+def test_no_other_module_touches_a_private_name():
+    trees = {
+        path: ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))
+    }
+    own = own_names(trees.values())
+    found = {
+        f"{path.relative_to(PACKAGE)}: {name}"
+        for path, tree in trees.items()
+        if path.name != "_torchrl.py"
+        for name in touched(tree, own)
+        if name not in ALLOWED
+    }
+    assert not found
+    # And the test can fail: the fence itself is full of them.
+    fence_tree = trees[PACKAGE / "_torchrl.py"]
+    assert len(set(touched(fence_tree, own))) >= 10
+
+
+def rows(n):
+    return TensorDict({"a": torch.arange(n), "next": {"b": torch.ones(n, 2)}}, [n])
+
+
+@pytest.fixture
+def rb():
+    rb = ReplayBuffer(storage=LazyTensorStorage(4), batch_size=2, prefetch=2)
+    rb.extend(rows(3))
+    return rb
+
+
+def test_storage_data_is_the_storage_itself(rb):
+    data = fence.storage_data(rb.storage)
+    assert data.shape == (4,)
+    data["a"][0] = 7
+    assert rb.storage[0]["a"] == 7
+    with pytest.raises(ValueError, match="the donor buffer is empty"):
+        fence.storage_data(LazyTensorStorage(4), "the donor buffer")
+    with pytest.raises(TypeError, match="is a ListStorage, wanted one that holds"):
+        fence.storage_data(ListStorage(4))
+    tensors = LazyTensorStorage(4)
+    tensors.set(range(2), torch.zeros(2))
+    with pytest.raises(TypeError, match="holds a Tensor, wanted a TensorDict"):
+        fence.storage_data(tensors)
+
+
+def test_every_write_changes_the_revision(rb):
+    seen = {fence.storage_revision(rb.storage)}
+    rb.extend(rows(1))
+    seen.add(fence.storage_revision(rb.storage))
+    rb.extend(rows(4))  # the same length, and the same place written last
+    seen.add(fence.storage_revision(rb.storage))
+    rb.storage.set(0, rows(1)[0])
+    seen.add(fence.storage_revision(rb.storage))
+    fence.add_revision(rb.storage)
+    seen.add(fence.storage_revision(rb.storage))
+    assert len(seen) == 5
+
+
+def test_a_new_leaf_is_written_once_forgotten(rb):
+    data = fence.storage_data(rb.storage)
+    with data.unlock_():
+        data["score"] = torch.zeros(4)
+    before = fence.storage_revision(rb.storage)
+    fence.forget_leaves(rb.storage)
+    assert fence.storage_revision(rb.storage) != before
+    rb.extend(rows(1).set("score", torch.ones(1)))
+    assert rb.storage[3]["score"] == 1
+
+
+def test_last_written(tmp_path):
+    rb = ReplayBuffer(storage=LazyTensorStorage(5), batch_size=2)
+    assert fence.last_written(rb) is None
+    for n, newest in ((3, 2), (1, 3), (3, 1)):
+        rb.extend(rows(n))
+        assert fence.last_written(rb) == fence.last_written(rb.storage) == newest
+    rb.dumps(tmp_path)
+    loaded = ReplayBuffer(storage=LazyTensorStorage(5), batch_size=2)
+    loaded.loads(tmp_path)
+    assert fence.last_written(loaded) == 1
+    dataset = ReplayBuffer(
+        storage=TensorStorage(rows(3)), writer=ImmutableDatasetWriter()
+    )
+    assert fence.last_written(dataset) is None
+
+
+def test_prefetched_batches_are_dropped(rb):
+    rb.sample()  # samples the next ones ahead
+    fence.storage_data(rb.storage)["a"].fill_(9)
+    fence.drop_prefetched(rb)
+    assert (rb.sample()["a"] == 9).all()
+
+
+def test_a_loaded_folder_becomes_memory_mapped(tmp_path):
+    rows(3).memmap(tmp_path)
+    for tell in (fence.mark_memmap, fence.known_to_be_memmap):
+        loaded = TensorDict.load_memmap(tmp_path)
+        tell(loaded)
+        assert loaded.is_memmap() and loaded["next"].is_memmap()
+        assert fence.memmap_folder(loaded) == str(tmp_path)
+    assert not fence.known_to_be_memmap(rows(3))
+    assert fence.memmap_folder(rows(3)) is None
+
+
+def test_a_leaf_leaves_the_mapping(tmp_path):
+    data = rows(3).memmap(tmp_path)
+    data.make_memmap(("caiac", "score"), shape=(3, 2), dtype=torch.float32)
+    fence.drop_memmap_leaf(data, ("caiac", "score"))
+    fence.drop_memmap_leaf(data, "a")
+    assert data.get(("caiac", "score"), None) is None and data.get("a", None) is None
+    assert data.is_memmap()
+
+
+@pytest.mark.parametrize("key", ["a", "a.b", "a/b", "a_b", "ä"])
+def test_file_name(key, tmp_path):
+    TensorDict({key: torch.zeros(1)}, [1]).memmap(tmp_path)
+    assert (tmp_path / f"{fence.file_name(key)}.memmap").exists()
+
+
+def test_memmap_storages_have_their_folder(tmp_path):
+    rb = ReplayBuffer(storage=LazyMemmapStorage(4, scratch_dir=tmp_path))
+    rb.extend(rows(2))
+    data = fence.storage_data(rb.storage)
+    assert fence.memmap_folder(data) == str(tmp_path) and data.is_memmap()
+
+
+class Square(LossModule):
+    @dataclass
+    class _AcceptedKeys:
+        priority_weight: str = "priority_weight"
+
+    def __init__(self):
+        super().__init__()
+        self.reduction = "sum"
+
+
+def test_losses_are_reduced_weighted_and_masked():
+    loss_module = Square()
+    loss = torch.tensor([1.0, 3.0])
+    assert fence.reduce_loss(loss_module, loss) == 4
+    assert fence.reduce_loss(loss_module, loss, reduction="mean") == 2
+    td = TensorDict({}, [2])
+    for key in fence.loss_masks(loss_module):
+        td[key] = torch.tensor([True, False])
+    assert fence.reduce_loss(loss_module, loss, td) == 1
+    assert fence.priority_weight(loss_module, td) is None
+
+
+def test_vmap_over_the_parameters_of_networks():
+    networks, x = [torch.nn.Linear(2, 1) for _ in range(3)], torch.randn(5, 2)
+    params = TensorDict.from_modules(*networks)
+    found = fence.vmap_loss(networks[0], (None, 0))(x, params)
+    torch.testing.assert_close(found, torch.stack([net(x) for net in networks]))
+
+
+@pytest.mark.parametrize("relu", [False, True])
+def test_linear_pointwise_is_a_linear_layer(relu):
+    x, weight, bias = torch.randn(5, 8), torch.randn(4, 8), torch.randn(4)
+    wanted = F.linear(x, weight, bias)
+    wanted = wanted.relu() if relu else wanted
+    for w in (weight, fence.packed_weight(weight)):
+        torch.testing.assert_close(fence.linear_pointwise(x, w, bias, relu), wanted)

@@ -1,0 +1,168 @@
+"""Files and folders that appear whole or not at all, and folders with one writer."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+__all__ = ["claim_folder", "plain", "whole_file", "whole_folder", "write_json"]
+
+_PARTIAL = ".partial-"
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Gives a file to write, which replaces ``path`` when the block ends well.
+
+    The parent folder is created if it is missing. An exception leaves the old file as
+    it was.
+
+    Args:
+        path (path): the file that is wanted.
+
+    Yields:
+        Path: a file beside it with the same suffix.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import whole_file
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with whole_file(f"{folder}/results/table.txt") as partial:
+        ...         _ = partial.write_text("42")
+        ...     open(f"{folder}/results/table.txt").read()
+        '42'
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{_PARTIAL}{os.getpid()}-{path.name}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Gives a folder to fill, which replaces ``path`` when the block ends well.
+
+    Args:
+        path (path): the folder that is wanted.
+
+    Yields:
+        Path: a folder on the same file system, which does not exist yet.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import whole_folder
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with whole_folder(f"{folder}/data") as partial:
+        ...         partial.mkdir()
+        ...     os.path.isdir(f"{folder}/data")
+        True
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
+    made, replaced = partial / path.name, partial / f"replaced-{path.name}"
+    try:
+        yield made
+        was_there = path.exists()
+        if was_there:
+            os.replace(path, replaced)
+        try:
+            os.replace(made, path)
+        except OSError:
+            if was_there:
+                os.replace(replaced, path)
+            raise
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON keeps it: mappings become dictionaries, sequences lists.
+
+    Args:
+        value (Any): a ``DictConfig`` for example.
+
+    Returns:
+        Any: the same content in plain containers.
+
+    Examples:
+        >>> from torchrl_caiac._files import plain
+        >>> plain({"sizes": (1, 2)})
+        {'sizes': [1, 2]}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(value[key]) for key in value}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [plain(item) for item in value]
+    return value
+
+
+def write_json(
+    path: str | os.PathLike[str], value: Any, *, indent: int | None = 1
+) -> None:
+    """Writes a value as JSON, whole or not at all.
+
+    Args:
+        path (path): the file, replaced if it exists.
+        value (Any): mappings, sequences, strings, numbers, booleans and ``None``.
+
+    Keyword Args:
+        indent (int, optional): spaces for each level. Defaults to 1.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import write_json
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_json(f"{folder}/a.json", {"b": (1, 2)})
+        ...     json.load(open(f"{folder}/a.json"))
+        {'b': [1, 2]}
+    """
+    text = json.dumps(plain(value), indent=indent) + "\n"
+    with whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def claim_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Makes this process the only one that may work in a folder.
+
+    The claim ends with the block, or with the process.
+
+    Args:
+        folder (path): created if it is missing; gets a file ``.lock``.
+
+    Raises:
+        RuntimeError: another process has claimed the folder.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import claim_folder
+        >>> with tempfile.TemporaryDirectory() as folder, claim_folder(folder):
+        ...     pass  # only this process writes here
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise RuntimeError(
+            f"another process works in {folder}: wait for it, end it, or give another "
+            "folder"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()

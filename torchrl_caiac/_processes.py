@@ -1,0 +1,212 @@
+"""Jobs in processes of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from itertools import islice
+from multiprocessing.util import Finalize
+from typing import Any
+
+import torch
+
+__all__ = [
+    "available_processors",
+    "bar_position",
+    "end_with_parent",
+    "run_in_processes",
+]
+
+_POSITION = "TQDM_POSITION"
+# Libraries read these when they are loaded, so they are set before a process starts.
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# What `setup` made in this process, or the error that it raised.
+_worker: tuple[Any, ...] = ()
+_setup_error: Exception | None = None
+
+
+def available_processors() -> int:
+    """The processors that this process may use.
+
+    Examples:
+        >>> from torchrl_caiac._processes import available_processors
+        >>> available_processors() >= 1
+        True
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def bar_position() -> int:
+    """The line for the progress bars of this process.
+
+    Returns:
+        int: ``position=`` for ``tqdm``; 0 outside of :func:`run_in_processes`.
+
+    Examples:
+        >>> from torchrl_caiac._processes import bar_position
+        >>> bar_position()
+        0
+    """
+    return int(os.environ.get(_POSITION, "0"))
+
+
+def run_in_processes(
+    function: Callable[..., Any],
+    jobs: Iterable[tuple[Any, ...]],
+    *,
+    processes: int = 2,
+    setup: Callable[[], Any] | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Runs jobs in separate processes, in which torch has one thread.
+
+    Jobs start in order; the next one starts when one has finished. If a job raises,
+    jobs that have not started are dropped, and the error is raised when the running
+    ones have ended. The processes end with this one, however it ends. They are started
+    by ``spawn``, so a script needs the usual ``if __name__ == "__main__":``.
+
+    Args:
+        function (callable): runs one job; picklable, as are its results.
+        jobs (iterable of tuple): the arguments of each job.
+
+    Keyword Args:
+        processes (int): how many run at a time; with 0 the jobs run in this process,
+            one after another. Defaults to 2.
+        setup (callable, optional): called once in each process. ``function`` gets its
+            result as the first argument; it is closed at the end if it has ``close``.
+
+    Yields:
+        tuple[int, Any]: the number of a finished job and its result, in the order in
+        which jobs finish.
+
+    Raises:
+        ValueError: ``processes`` is negative.
+        RuntimeError: a process ended in the middle of a job, for lack of memory for
+            example.
+
+    Examples:
+        >>> from math import hypot
+        >>> from torchrl_caiac._processes import run_in_processes
+        >>> dict(run_in_processes(hypot, [(3, 4), (5, 12)], processes=1))
+        {0: 5.0, 1: 13.0}
+    """
+    if processes < 0:
+        raise ValueError(f"processes is {processes}, wanted at least 0")
+    if processes == 0:
+        yield from _run_here(function, jobs, setup)
+        return
+    # spawn: forked copies of torch's and OpenGL's threads may hang.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(
+        processes,
+        mp_context=context,
+        initializer=_start_worker,
+        initargs=(context.Value("i", 0), setup),
+    )
+    waiting = enumerate(jobs)
+    running: dict[Any, int] = {}
+
+    def start(count: int) -> None:
+        # Never more than there are processes: the pool cannot take back a job that it
+        # has queued for the next free process.
+        with _one_thread_in_new_processes():
+            for number, job in islice(waiting, count):
+                running[pool.submit(_run_job, function, job)] = number
+
+    try:
+        start(processes)
+        while running:
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            finished = [(running.pop(future), future.result()) for future in done]
+            start(len(finished))
+            yield from sorted(finished)
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            "a process ended in the middle of a job, killed for lack of memory "
+            "perhaps: finished jobs are kept, call again to resume"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _run_here(
+    function: Callable[..., Any],
+    jobs: Iterable[tuple[Any, ...]],
+    setup: Callable[[], Any] | None,
+) -> Iterator[tuple[int, Any]]:
+    made = () if setup is None else (setup(),)
+    try:
+        for number, job in enumerate(jobs):
+            yield number, function(*made, *job)
+    finally:
+        for value in made:
+            _close(value)
+
+
+@contextmanager
+def _one_thread_in_new_processes() -> Iterator[None]:
+    previous = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in previous.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _run_job(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
+    # Before every job: the one before may have raised it, as TorchRL's environments do.
+    torch.set_num_threads(1)
+    if _setup_error is not None:
+        raise _setup_error
+    return function(*_worker, *job)
+
+
+def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:
+    global _worker, _setup_error
+    end_with_parent()
+    with counter.get_lock():
+        os.environ[_POSITION] = str(counter.value)
+        counter.value += 1
+    torch.set_num_threads(1)
+    if setup is None:
+        return
+    try:
+        made = setup()
+    except Exception as error:  # raised here, it would break the pool without a word
+        _setup_error = error
+        return
+    Finalize(None, _close, (made,), exitpriority=0)
+    _worker = (made,)
+
+
+def end_with_parent() -> None:
+    """Lets this process end as soon as the one that started it has ended.
+
+    Without it, a process whose parent was killed would wait for work for ever, or go on
+    writing beside the parent's successor.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)  # at once: the main thread may be in the middle of a long job
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _close(value: Any) -> None:
+    close = getattr(value, "close", None)
+    if close is not None:
+        close()

@@ -1,0 +1,241 @@
+"""Every private name of torch, torchrl and tensordict that this package touches.
+
+They have no public counterpart in torch 2.14, torchrl 0.14 and tensordict 0.14. After
+an update of one of them, run ``tests/test_torchrl.py``: it tests each function here,
+and that no other module touches such a name.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import MemoryMappedTensor, TensorDictBase, is_tensor_collection
+from tensordict._utils_key_json import _encode_key_for_filesystem
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.objectives.common import LossModule
+from torchrl.objectives.utils import _vmap_func
+
+__all__ = [
+    "add_revision",
+    "drop_memmap_leaf",
+    "drop_prefetched",
+    "file_name",
+    "forget_leaves",
+    "known_to_be_memmap",
+    "last_written",
+    "linear_pointwise",
+    "loss_masks",
+    "mark_memmap",
+    "memmap_folder",
+    "packed_weight",
+    "priority_weight",
+    "reduce_loss",
+    "storage_data",
+    "storage_revision",
+    "vmap_loss",
+]
+
+
+# --- storages of replay buffers ------------------------------------------------------
+
+
+def storage_data(storage: Any, what: str = "the storage") -> TensorDictBase:
+    """The tensordict of a storage, all of its capacity, without a copy.
+
+    ``storage[:]`` is public, but raises for some index types and copies for others.
+
+    Args:
+        storage (TensorStorage): the storage.
+        what (str): how errors call it.
+
+    Returns:
+        TensorDictBase: the storage's own tensordict.
+
+    Raises:
+        TypeError: it is no :class:`~torchrl.data.TensorStorage` of tensordicts.
+        ValueError: it is empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> from torchrl_caiac._torchrl import storage_data
+        >>> storage = LazyTensorStorage(5)
+        >>> storage.set(range(2), TensorDict({"a": torch.zeros(2)}, [2]))
+        >>> storage_data(storage)["a"].shape
+        torch.Size([5])
+    """
+    if not isinstance(storage, TensorStorage):
+        raise TypeError(
+            f"{what} is a {type(storage).__name__}, wanted one that holds a tensordict "
+            "of all rows: LazyTensorStorage, LazyMemmapStorage or TensorStorage"
+        )
+    if not storage.initialized or not len(storage):
+        raise ValueError(f"{what} is empty: extend it with data first")
+    data = storage._storage
+    if not is_tensor_collection(data):
+        raise TypeError(
+            f"{what} holds a {type(data).__name__}, wanted a TensorDict: extend the "
+            "buffer with tensordicts"
+        )
+    return data
+
+
+def storage_revision(storage: TensorStorage) -> tuple[Any, ...]:
+    """A value that changes with every write through the storage."""
+    return (
+        int(storage._mutation_revision),
+        len(storage),
+        storage._last_cursor_index,
+    )
+
+
+def add_revision(storage: TensorStorage) -> None:
+    """Tells a storage that its tensors were written to directly."""
+    storage._bump_mutation_revision()
+
+
+def forget_leaves(storage: TensorStorage) -> None:
+    """Tells a storage that leaves were added: it caches their names for writing."""
+    storage._storage_keys = None
+    add_revision(storage)
+
+
+def last_written(source: ReplayBuffer | TensorStorage) -> int | None:
+    """The row that was written last.
+
+    A buffer that was loaded from disk knows it from its writer's cursor alone, so pass
+    the buffer where there is one.
+
+    Args:
+        source (ReplayBuffer or TensorStorage): the buffer, or its storage.
+
+    Returns:
+        int, optional: the row; ``None`` where neither the storage nor the writer
+        knows it, as for a buffer over a finished dataset.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> from torchrl_caiac._torchrl import last_written
+        >>> rb = ReplayBuffer(storage=LazyTensorStorage(4))
+        >>> _ = rb.extend(TensorDict({"a": torch.zeros(6)}, [6])[:3])
+        >>> last_written(rb)
+        2
+    """
+    is_buffer = isinstance(source, ReplayBuffer)
+    storage = source.storage if is_buffer else source
+    newest = getattr(storage, "_last_cursor_index", None)
+    if newest is not None:
+        return int(newest)
+    cursor = getattr(source.writer, "_cursor", None) if is_buffer else None
+    if cursor is None or not len(storage):
+        return None
+    return (int(cursor) - 1) % len(storage)
+
+
+def drop_prefetched(rb: ReplayBuffer) -> None:
+    """Drops batches that a buffer has sampled ahead."""
+    with rb._futures_lock:
+        rb._clear_prefetch_queue_locked()
+
+
+# --- memory-mapped tensordicts -------------------------------------------------------
+
+
+def file_name(key: str) -> str:
+    """The file name, without suffix, that tensordict gives to an entry."""
+    name: str = _encode_key_for_filesystem(key)
+    return name
+
+
+def memmap_folder(td: TensorDictBase) -> str | None:
+    """The folder of a memory-mapped tensordict, ``None`` where it has none."""
+    prefix = getattr(td, "_memmap_prefix", None)
+    return None if prefix is None else str(prefix)
+
+
+def mark_memmap(td: TensorDictBase) -> None:
+    """Tells a loaded tensordict, and those below it, that they are memory-mapped.
+
+    ``load_memmap`` does not. ``memmap_`` would, and write the folder's ``meta.json``
+    again while other processes may read it.
+    """
+    nodes = (v for v in td.values(True) if isinstance(v, TensorDictBase))
+    for node in (td, *nodes):
+        node._is_memmap = True
+
+
+def known_to_be_memmap(td: TensorDictBase) -> bool:
+    """Whether a tensordict is memory-mapped; one that was loaded is told so first."""
+    if not td.is_memmap() and memmap_folder(td) is not None:
+        leaves = td.values(include_nested=True, leaves_only=True)
+        if all(isinstance(leaf, MemoryMappedTensor) for leaf in leaves):
+            mark_memmap(td)
+    return td.is_memmap()
+
+
+def drop_memmap_leaf(td: TensorDictBase, key: NestedKey) -> None:
+    """Takes a leaf out of a memory-mapped tensordict, not out of its folder.
+
+    ``del_`` needs an unlocked tensordict, and an unlocked one is memory-mapped no more.
+    """
+    parents, name = ((), key) if isinstance(key, str) else (key[:-1], key[-1])
+    node = td.get(parents) if parents else td
+    node._tensordict.pop(name)
+    td._erase_cache()
+    node._erase_cache()
+
+
+# --- objectives ----------------------------------------------------------------------
+
+
+def reduce_loss(
+    loss_module: LossModule, loss: Tensor, *args: Any, **kwargs: Any
+) -> Tensor:
+    """Reduces a loss as the module's ``reduction`` and masks say."""
+    reduced: Tensor = loss_module._reduce_loss(loss, *args, **kwargs)
+    return reduced
+
+
+def priority_weight(loss_module: LossModule, td: TensorDictBase) -> Tensor | None:
+    """The importance weights of a batch, ``None`` where it has none."""
+    weight: Tensor | None = loss_module._maybe_get_priority_weight(td)
+    return weight
+
+
+def loss_masks(loss_module: LossModule) -> list[NestedKey]:
+    """The keys of the masks that a loss module honours."""
+    return list(loss_module._loss_mask_keys())
+
+
+def vmap_loss(*args: Any, **kwargs: Any) -> Any:
+    """TorchRL's :func:`torch.vmap` over functional networks."""
+    return _vmap_func(*args, **kwargs)
+
+
+# --- products on CPUs ----------------------------------------------------------------
+
+
+def linear_pointwise(
+    value: Tensor, weight: Tensor, bias: Tensor | None, relu: bool
+) -> Tensor:
+    """OneDNN's linear layer ``[B, I]`` to ``[B, O]``, in float32 on a CPU.
+
+    It is what ``torch.compile`` makes of ``F.linear``.
+    """
+    after = "relu" if relu else "none"
+    product: Tensor = torch.ops.mkldnn._linear_pointwise(
+        value, weight, bias, after, [], ""
+    )
+    return product
+
+
+def packed_weight(weight: Tensor) -> Tensor:
+    """A weight ``[O, I]`` in the order that oneDNN reads fastest, for inference."""
+    packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight)
+    return packed

@@ -1,0 +1,218 @@
+"""Which stored transition follows which: the one index of trajectories."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import ReplayBuffer, TensorStorage
+
+from torchrl_caiac._keys import missing_key
+from torchrl_caiac._torchrl import last_written, storage_data
+
+__all__ = ["TrajectoryIndex", "trajectory_index"]
+
+# Where TorchRL's collectors store trajectory ids.
+_COLLECTOR_KEY: NestedKey = ("collector", "traj_ids")
+_CHUNK = 1 << 20
+
+
+class TrajectoryIndex(NamedTuple):
+    """Where the trajectories of a storage end, in the order of time.
+
+    The row ``r`` is at position ``(r - oldest) % length``. Positions count from the
+    oldest row, so no trajectory wraps around. The index takes 4 bytes for each row.
+
+    Attributes:
+        length (int): rows in the storage, ``T``.
+        oldest (int): the oldest row, the one after the write cursor of a full ring.
+        ends (torch.Tensor): int64 ``[E]``, ascending positions of last rows.
+        left (torch.Tensor): integer ``[T]``, how many rows of the same trajectory
+            follow each row.
+    """
+
+    length: int
+    oldest: int
+    ends: torch.Tensor
+    left: torch.Tensor
+
+    @property
+    def device(self) -> torch.device:
+        """Where the index is."""
+        return self.ends.device
+
+    @property
+    def lengths(self) -> torch.Tensor:
+        """The number of rows of each trajectory, int64 ``[E]``."""
+        return self.ends.diff(prepend=self.ends.new_tensor([-1]))
+
+    @property
+    def starts(self) -> torch.Tensor:
+        """The first row of each trajectory, int64 ``[E]``."""
+        return self.rows(self.ends - self.lengths + 1)
+
+    @property
+    def wraps(self) -> bool:
+        """Whether a trajectory goes on from the storage's last row to its first."""
+        return self.oldest > 0 and bool(self.left[self.length - 1] > 0)
+
+    def position(self, rows: torch.Tensor) -> torch.Tensor:
+        """The positions of rows ``[*]``, int64 ``[*]``."""
+        return (rows - self.oldest) % self.length
+
+    def rows(self, position: torch.Tensor) -> torch.Tensor:
+        """The rows at positions ``[*]``, int64 ``[*]``."""
+        return (position + self.oldest) % self.length
+
+    def remaining(self, rows: torch.Tensor) -> torch.Tensor:
+        """How many rows of the same trajectory follow each row, int64 ``[*]``."""
+        found = self.left.index_select(0, rows.to(self.device).reshape(-1))
+        return found.view(rows.shape).long()
+
+    def is_last(self, rows: torch.Tensor) -> torch.Tensor:
+        """Whether rows ``[*]`` are the last of their trajectories, bool ``[*]``."""
+        return self.remaining(rows) == 0
+
+    def later(self, rows: torch.Tensor, steps: torch.Tensor | int) -> torch.Tensor:
+        """The rows some steps later, at most :meth:`remaining`, int64 ``[*]``."""
+        return (rows + steps) % self.length
+
+    def numbers(self) -> torch.Tensor:
+        """The trajectory of each row, from 0 in the order of time, int64 ``[T]``."""
+        counts = torch.arange(len(self.ends), device=self.device)
+        return counts.repeat_interleave(self.lengths).roll(self.oldest)
+
+
+def trajectory_index(
+    source: ReplayBuffer | TensorStorage | TensorDictBase,
+    *,
+    trajectory_key: NestedKey | None = "episode",
+    done_key: NestedKey | None = ("next", "done"),
+) -> TrajectoryIndex:
+    """Finds the trajectories of stored transitions.
+
+    The transitions of a trajectory lie one after another. A trajectory ends where the
+    id in ``trajectory_key`` changes, where ``done_key`` is set, at the row that was
+    written last, and at the end of the storage; in a full ring it goes on from the last
+    row to the first. Where the data have no ``trajectory_key``, the ids of TorchRL's
+    collectors in ``("collector", "traj_ids")`` are read. Data with ids may lack
+    ``done_key``.
+
+    Args:
+        source (ReplayBuffer, TensorStorage or TensorDictBase): the transitions
+            ``[T]``.
+
+    Keyword Args:
+        trajectory_key (NestedKey, optional): trajectory ids ``[T]`` or ``[T, 1]``;
+            ``None`` to rely on ``done_key`` alone. Defaults to ``"episode"``.
+        done_key (NestedKey, optional): end flags ``[T]`` or ``[T, 1]``; ``None`` to
+            rely on ``trajectory_key`` alone. Defaults to ``("next", "done")``.
+
+    Returns:
+        TrajectoryIndex: the trajectories.
+
+    Raises:
+        KeyError: the data lack the leaf.
+        TypeError: the storage holds no tensordict.
+        ValueError: the storage is empty or has several dimensions, a leaf does not
+            have one value for each row, or both keys are ``None``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.trajectories import trajectory_index
+        >>> index = trajectory_index(
+        ...     TensorDict({"episode": torch.tensor([0, 0, 0, 1])}, [4])
+        ... )
+        >>> index.ends, index.remaining(torch.tensor([0, 2]))
+        (tensor([2, 3]), tensor([2, 0]))
+    """
+    newest = None
+    if isinstance(source, TensorDictBase):
+        data, length = source, len(source)
+    else:
+        storage = source.storage if isinstance(source, ReplayBuffer) else source
+        data, length = storage_data(storage), len(storage)
+        if storage.ndim != 1:
+            raise ValueError(
+                f"the storage has ndim={storage.ndim}, wanted 1: store flat "
+                "transitions, with trajectory ids"
+            )
+        newest = last_written(source)
+    ids, done = _leaves(data, length, trajectory_key, done_key)
+    # Only a full ring goes on from its last row to its first.
+    is_ring = length == data.shape[0] and newest is not None and newest < length - 1
+    oldest = newest + 1 if is_ring and newest is not None else 0
+    leaf = done if ids is None else ids
+    assert leaf is not None  # one of them is there
+    last = torch.zeros(length, dtype=torch.bool, device=leaf.device)
+    if ids is not None:
+        ids = ids.roll(-oldest) if oldest else ids
+        last[:-1] = ids[1:] != ids[:-1]
+    if done is not None:
+        last |= done.roll(-oldest) if oldest else done
+    last[-1] = True
+    if newest is not None and newest < length:
+        last[(newest - oldest) % length] = True
+    ends = last.nonzero()[:, 0]
+    dtype = torch.int32 if length < 1 << 31 else torch.int64
+    left = ends.to(dtype).repeat_interleave(ends.diff(prepend=ends.new_tensor([-1])))
+    for start in range(0, length, _CHUNK):
+        part = left[start : start + _CHUNK]
+        part -= torch.arange(start, start + len(part), dtype=dtype, device=left.device)
+    return TrajectoryIndex(length, oldest, ends, left.roll(oldest) if oldest else left)
+
+
+def _leaves(
+    data: TensorDictBase,
+    length: int,
+    trajectory_key: NestedKey | None,
+    done_key: NestedKey | None,
+) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """The ids and the end flags ``[T]``, as far as they are there and wanted."""
+    if trajectory_key is None and done_key is None:
+        raise ValueError(
+            "trajectory_key and done_key are both None: one of them must tell where "
+            "trajectories end"
+        )
+    ids = done = None
+    if trajectory_key is not None:
+        ids = data.get(trajectory_key, None)
+        if ids is None:
+            ids = data.get(_COLLECTOR_KEY, None)
+        if ids is None:
+            raise missing_key(
+                data,
+                trajectory_key,
+                "the transitions lack the trajectory ids",
+                "name the leaf that has them; or pass trajectory_key=None to tell "
+                "trajectories apart by end flags alone, which is right only where the "
+                "transitions of each lie one after another",
+            )
+    if done_key is not None:
+        done = data.get(done_key, None)
+        if done is None and ids is None:
+            raise missing_key(
+                data,
+                done_key,
+                "the transitions lack the end flags",
+                "name the leaf that has them by done_key",
+            )
+    return (
+        None if ids is None else _flat(ids, length, trajectory_key),
+        None if done is None else _flat(done, length, done_key).bool(),
+    )
+
+
+def _flat(leaf: torch.Tensor, length: int, key: NestedKey | None) -> torch.Tensor:
+    if not isinstance(leaf, torch.Tensor):
+        raise TypeError(f"{key!r} is a {type(leaf).__name__}, wanted a tensor")
+    if leaf.numel() != leaf.shape[0]:
+        raise ValueError(
+            f"{key!r} has shape {list(leaf.shape)}, wanted [T] or [T, 1]: one value "
+            "for each transition"
+        )
+    # A memory-mapped tensor as a plain one skips its Python dispatch.
+    return leaf.as_subclass(torch.Tensor)[:length].reshape(length)
