@@ -46,9 +46,9 @@ from torchrl_caiac.data import (
 )
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.envs import KitchenEnv, fetch_push_layout
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import CAI, causal_action_influence, score_buffer
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
-from torchrl_caiac.objectives import fit_world_model
 from torchrl_caiac.objectives.entity_dynamics import gaussian_nll
 
 STATES = {"cpu": 1024, "cuda": 65_536}

@@ -52,8 +52,10 @@ OPTIONAL = (
 )
 CORE = (
     "torchrl_caiac",
+    "torchrl_caiac.checkpoint",
     "torchrl_caiac.data",
     "torchrl_caiac.experiments",
+    "torchrl_caiac.fit",
     "torchrl_caiac.influence",
     "torchrl_caiac.modules",
     "torchrl_caiac.objectives",

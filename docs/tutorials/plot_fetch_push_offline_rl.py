@@ -36,6 +36,7 @@ from torchrl_caiac.envs import (
     fetch_push_reward,
     make_fetch_push_env,
 )
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import (
     CAI,
     influence_report,
@@ -48,7 +49,7 @@ from torchrl_caiac.modules import (
     GoalConditionedCritic,
     GoalFeatures,
 )
-from torchrl_caiac.objectives import GoalConditionedTD3Loss, fit_world_model
+from torchrl_caiac.objectives import GoalConditionedTD3Loss
 from torchrl_caiac.plotting import plot_frames, plot_influence
 from torchrl_caiac.transforms import HindsightGoal
 

@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_caiac import CAIACTransform, EntityLayout
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import CAI, roc_auc, score_buffer
 from torchrl_caiac.modules import GaussianWorldModel
-from torchrl_caiac.objectives import fit_world_model
 
 torch.manual_seed(0)
 torch.set_num_threads(1)

@@ -35,9 +35,10 @@ from torchrl_caiac.envs import (
     RenderingUnavailable,
     make_kitchen_env,
 )
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import CAI, roc_auc, score_buffer, true_influence
 from torchrl_caiac.modules import GaussianWorldModel, LMPActor, LMPModel
-from torchrl_caiac.objectives import LMPLoss, fit_world_model
+from torchrl_caiac.objectives import LMPLoss
 from torchrl_caiac.plotting import plot_frames, plot_influence
 from torchrl_caiac.transforms import WindowGoal
 

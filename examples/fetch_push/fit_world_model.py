@@ -22,8 +22,8 @@ from omegaconf import DictConfig
 
 from torchrl_caiac.envs import fetch_push_layout
 from torchrl_caiac.experiments import claim_folder, keep_settings, write_json
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
-from torchrl_caiac.objectives import fit_world_model
 
 LAYOUT = fetch_push_layout(2)
 # What the models predict: the positions of the gripper and its fingers, and the cubes'.

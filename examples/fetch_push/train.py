@@ -25,10 +25,10 @@ from torchrl.record.loggers import get_logger
 from tqdm.auto import tqdm
 
 from torchrl_caiac import CAIACTransform, CoDATransform
+from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.envs import fetch_push_reward
 from torchrl_caiac.experiments import (
-    TrainingCheckpoint,
     bar_position,
     claim_folder,
     keep_settings,

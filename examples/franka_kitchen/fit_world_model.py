@@ -23,8 +23,8 @@ from omegaconf import DictConfig
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
 from torchrl_caiac.experiments import keep_settings, write_json
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
-from torchrl_caiac.objectives import fit_world_model
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -24,10 +24,10 @@ from torchrl.record.loggers import get_logger
 from tqdm.auto import tqdm
 
 from torchrl_caiac import CAIACTransform, CoDATransform
+from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
 from torchrl_caiac.experiments import (
-    TrainingCheckpoint,
     bar_position,
     keep_settings,
 )

@@ -11,13 +11,14 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
     evaluating,
     with_class,
 )
-from torchrl_caiac.objectives import EntityDynamicsLoss, fit_world_model
+from torchrl_caiac.objectives import EntityDynamicsLoss
 
 LAYOUT = EntityLayout({"arm": [0, 1], "cup": [2]})
 

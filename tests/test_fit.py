@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+import torchrl_caiac.fit as module
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
 from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss
-from torchrl_caiac.objectives.fit_world_model import fit_world_model
 
-module = importlib.import_module("torchrl_caiac.objectives.fit_world_model")
 LAYOUT = EntityLayout({"arm": [0, 1], "cup": [2, 3]})
 
 

@@ -26,7 +26,7 @@ from torchrl_caiac.modules.entity_dynamics_model import (
 
 __all__ = ["fit_world_model"]
 
-_LOGGER = logging.getLogger("torchrl_caiac.fit_world_model")
+_LOGGER = logging.getLogger("torchrl_caiac.fit")
 _FORMAT = "torchrl_caiac.fit_world_model/1"
 _CHUNK = 65_536  # rows read at once from the data
 _EVAL_ROWS = 4_096  # rows through the network at once in validation
@@ -105,7 +105,7 @@ def fit_world_model(
         >>> from tensordict import TensorDict
         >>> from torchrl_caiac import EntityLayout
         >>> from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
-        >>> from torchrl_caiac.objectives.fit_world_model import fit_world_model
+        >>> from torchrl_caiac.fit import fit_world_model
         >>> observation, action = torch.randn(200, 2), torch.randn(200, 1)
         >>> td = TensorDict(
         ...     {
