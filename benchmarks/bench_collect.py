@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_caiac.data import create_fetch_push_expert
+from torchrl_caiac.envs import create_fetch_push_expert
 
 EPISODES = 300
 

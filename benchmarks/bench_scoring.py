@@ -36,8 +36,6 @@ from torchrl.data import ReplayBuffer, TensorStorage
 
 from benchmarks.ratios import seconds
 from torchrl_caiac.data import (
-    create_fetch_push_expert,
-    create_fetch_push_random,
     create_kitchen_play,
     create_kitchen_random,
     kitchen_transitions,
@@ -45,7 +43,12 @@ from torchrl_caiac.data import (
     mix_trajectories,
 )
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.envs import KitchenEnv, fetch_push_layout
+from torchrl_caiac.envs import (
+    KitchenEnv,
+    create_fetch_push_expert,
+    create_fetch_push_random,
+    fetch_push_layout,
+)
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import CAI, causal_action_influence, score_buffer
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel

@@ -21,8 +21,6 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import (
-    create_fetch_push_expert,
-    create_fetch_push_random,
     load_minari,
     mix_trajectories,
     offline_buffer,
@@ -32,6 +30,8 @@ from torchrl_caiac.envs import (
     FetchPushExpert,
     FetchPushTruth,
     RenderingUnavailable,
+    create_fetch_push_expert,
+    create_fetch_push_random,
     fetch_push_layout,
     fetch_push_reward,
     make_fetch_push_env,

@@ -13,12 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
 from torchrl_caiac.data import (
-    create_fetch_push_expert,
-    create_fetch_push_random,
     load_minari,
     load_transitions,
     mix_trajectories,
 )
+from torchrl_caiac.envs import create_fetch_push_expert, create_fetch_push_random
 from torchrl_caiac.experiments import claim_folder, keep_settings
 
 MAKERS = {"expert": create_fetch_push_expert, "random": create_fetch_push_random}

@@ -12,8 +12,11 @@ from tensordict import TensorDict
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import offline_buffer
-from torchrl_caiac.envs.fetch_push import FetchPushCubes, FetchPushTruth
-from torchrl_caiac.envs.fetch_push_expert import FetchPushExpert
+from torchrl_caiac.envs.fetch_push import (
+    FetchPushCubes,
+    FetchPushExpert,
+    FetchPushTruth,
+)
 from torchrl_caiac.envs.kitchen import KitchenEnv
 from torchrl_caiac.envs.kitchen_expert import KitchenExpert
 from torchrl_caiac.influence import score_buffer

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
-from torchrl_caiac.data.fetch_push_datasets import (
-    create_fetch_push_expert,
-    create_fetch_push_random,
-)
 from torchrl_caiac.data.kitchen_datasets import (
     create_kitchen_demonstrations,
     create_kitchen_play,
@@ -21,8 +17,6 @@ from torchrl_caiac.data.offline_buffer import offline_buffer
 
 __all__ = [
     "collect_episodes",
-    "create_fetch_push_expert",
-    "create_fetch_push_random",
     "create_kitchen_demonstrations",
     "create_kitchen_play",
     "create_kitchen_random",

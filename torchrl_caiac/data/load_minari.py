@@ -72,7 +72,8 @@ def load_minari(
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_caiac.data import create_fetch_push_random, load_minari
+        >>> from torchrl_caiac.data import load_minari
+        >>> from torchrl_caiac.envs import create_fetch_push_random
         >>> folder = tempfile.TemporaryDirectory()
         >>> dataset = create_fetch_push_random(
         ...     episodes=2, steps=5, root=folder.name, workers=1, progress=False

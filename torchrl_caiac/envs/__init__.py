@@ -5,14 +5,16 @@ from __future__ import annotations
 from torchrl_caiac.envs.fetch_push import (
     FETCH_PUSH_ENV_ID,
     FetchPushCubes,
+    FetchPushExpert,
     FetchPushState,
     FetchPushTruth,
+    create_fetch_push_expert,
+    create_fetch_push_random,
     fetch_push_distances,
     fetch_push_layout,
     fetch_push_reward,
     make_fetch_push_env,
 )
-from torchrl_caiac.envs.fetch_push_expert import FetchPushExpert
 from torchrl_caiac.envs.kitchen import (
     KITCHEN_ENV_ID,
     KITCHEN_TASKS,
@@ -37,6 +39,8 @@ __all__ = [
     "KitchenExpert",
     "KitchenState",
     "RenderingUnavailable",
+    "create_fetch_push_expert",
+    "create_fetch_push_random",
     "fetch_push_distances",
     "fetch_push_layout",
     "fetch_push_reward",

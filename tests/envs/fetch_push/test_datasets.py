@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_caiac.data import (
+from torchrl_caiac.data import load_minari, mix_trajectories
+from torchrl_caiac.data.minari_files import open_minari
+from torchrl_caiac.envs.fetch_push import (
+    FetchPushCubes,
+    FetchPushExpert,
     create_fetch_push_expert,
     create_fetch_push_random,
-    load_minari,
-    mix_trajectories,
 )
-from torchrl_caiac.data.fetch_push_datasets import _Factory
-from torchrl_caiac.data.minari_files import open_minari
-from torchrl_caiac.envs.fetch_push import FetchPushCubes
-from torchrl_caiac.envs.fetch_push_expert import FetchPushExpert
+from torchrl_caiac.envs.fetch_push.datasets import _Factory
 
 STEPS = 45
 NOISE = 0.1

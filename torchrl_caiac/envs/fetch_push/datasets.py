@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["create_fetch_push_expert", "create_fetch_push_random"]
 
-logger = logging.getLogger("torchrl_caiac.data.fetch_push_datasets")
+logger = logging.getLogger("torchrl_caiac.envs.fetch_push.datasets")
 
 _POLICIES = _EXPERT, _RANDOM = ("expert", "random")
 
@@ -95,7 +95,8 @@ def create_fetch_push_expert(
 
     Example:
         >>> import tempfile
-        >>> from torchrl_caiac.data import create_fetch_push_expert, load_minari
+        >>> from torchrl_caiac.data import load_minari
+        >>> from torchrl_caiac.envs import create_fetch_push_expert
         >>> with tempfile.TemporaryDirectory() as root:
         ...     dataset = create_fetch_push_expert(
         ...         episodes=2, steps=5, root=root, workers=1, progress=False)
@@ -250,7 +251,7 @@ def _create(
             (buffer for file in report.files for buffer in _buffers(file)),
             target,
             lambda: _make_env(policy.num_cubes, policy.steps),
-            code="torchrl_caiac/data/fetch_push_datasets.py",
+            code="torchrl_caiac/envs/fetch_push/datasets.py",
             progress=progress,
             description=f"{description}: {summary}",
             algorithm_name=algorithm_name,
@@ -272,7 +273,7 @@ class _Factory:
 def _make_env(num_cubes: int, steps: int) -> Any:
     import gymnasium
 
-    from torchrl_caiac.envs.fetch_push import FETCH_PUSH_ENV_ID, FetchPushCubes
+    from torchrl_caiac.envs.fetch_push.env import FETCH_PUSH_ENV_ID, FetchPushCubes
 
     arguments: dict[str, Any] = {"num_cubes": num_cubes, "max_episode_steps": steps}
     env = FetchPushCubes(**arguments)
@@ -296,13 +297,13 @@ class _Source:
         return {"seeds": seeds, **stack_trees(episodes)}
 
     def _episode(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any]:
-        from torchrl_caiac.envs.fetch_push import fetch_push_distances
+        from torchrl_caiac.envs.fetch_push.env import fetch_push_distances
 
         observation, _ = self.env.reset(seed=seed)
         # Not the stream that starts and goals are drawn from.
         rng = np.random.default_rng([seed, 1])
         if spec["name"] == _EXPERT:
-            from torchrl_caiac.envs.fetch_push_expert import FetchPushExpert
+            from torchrl_caiac.envs.fetch_push.expert import FetchPushExpert
 
             act: Callable[[Any], Any] = FetchPushExpert(
                 spec["num_cubes"], action_noise=spec["action_noise"], rng=rng

@@ -4,7 +4,7 @@ Its action is a function of the observation and the goal, so that a policy that 
 same can learn it: from demonstrations with hidden phases ("now going around the cube")
 nothing can be learnt that acts on observations.
 
-``python -m torchrl_caiac.envs.fetch_push_expert --episodes 200 --action-noise 0.2``
+``python -m torchrl_caiac.envs.fetch_push.expert --episodes 200 --action-noise 0.2``
 measures it.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FetchPushExpert"]
 
-logger = logging.getLogger("torchrl_caiac.envs.fetch_push_expert")
+logger = logging.getLogger("torchrl_caiac.envs.fetch_push.expert")
 
 # Heights of the gripper, metres: the fingers' tips next to a cube, and above all cubes.
 _PUSH_HEIGHT, _SAFE_HEIGHT = 0.425, 0.50
@@ -79,7 +79,7 @@ class FetchPushExpert:
         ValueError: ``num_cubes`` or ``action_noise`` is out of range.
 
     Example:
-        >>> from torchrl_caiac.envs.fetch_push import FetchPushCubes
+        >>> from torchrl_caiac.envs.fetch_push.env import FetchPushCubes
         >>> env, expert = FetchPushCubes(2), FetchPushExpert(2)
         >>> observation, info = env.reset(seed=0)
         >>> for _ in range(100):
@@ -123,7 +123,7 @@ class FetchPushExpert:
         """Return the action without noise.
 
         Args:
-            observation: of :class:`~torchrl_caiac.envs.fetch_push.FetchPushCubes`, or
+            observation: of :class:`~torchrl_caiac.envs.FetchPushCubes`, or
                 a batch: ``"observation"`` ``[*B, 10 + 12 n]`` and ``"desired_goal"``
                 ``[*B, 3 n]``.
 
@@ -246,7 +246,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
 
-    from torchrl_caiac.envs.fetch_push import FetchPushCubes
+    from torchrl_caiac.envs.fetch_push.env import FetchPushCubes
 
     steps = 100
     env = FetchPushCubes(options.cubes, max_episode_steps=steps)

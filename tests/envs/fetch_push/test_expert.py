@@ -10,9 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_caiac.envs import fetch_push_expert
-from torchrl_caiac.envs.fetch_push import FetchPushCubes
-from torchrl_caiac.envs.fetch_push_expert import FetchPushExpert
+from torchrl_caiac.envs.fetch_push import FetchPushCubes, FetchPushExpert, expert
 
 HIGH = 0.5
 
@@ -232,8 +230,8 @@ def test_bad_observations(env):
 
 
 def test_main_says_the_success(caplog):
-    with caplog.at_level(logging.INFO, logger=fetch_push_expert.logger.name):
-        assert fetch_push_expert.main(["--cubes", "1", "--episodes", "2"]) == 0
+    with caplog.at_level(logging.INFO, logger=expert.logger.name):
+        assert expert.main(["--cubes", "1", "--episodes", "2"]) == 0
     text = caplog.text
     assert "50 steps" in text and "100 steps" in text
     assert "in 1.000 and at the last step" in text

@@ -1,0 +1,35 @@
+"""Fetch-Push with several cubes: environment, expert, ground truth and datasets."""
+
+from __future__ import annotations
+
+from torchrl_caiac.envs.fetch_push.datasets import (
+    create_fetch_push_expert,
+    create_fetch_push_random,
+)
+from torchrl_caiac.envs.fetch_push.env import (
+    FETCH_PUSH_ENV_ID,
+    FetchPushCubes,
+    FetchPushState,
+    FetchPushTruth,
+    fetch_push_distances,
+    fetch_push_layout,
+    fetch_push_reward,
+    make_fetch_push_env,
+    register_fetch_push,
+)
+from torchrl_caiac.envs.fetch_push.expert import FetchPushExpert
+
+__all__ = [
+    "FETCH_PUSH_ENV_ID",
+    "FetchPushCubes",
+    "FetchPushExpert",
+    "FetchPushState",
+    "FetchPushTruth",
+    "create_fetch_push_expert",
+    "create_fetch_push_random",
+    "fetch_push_distances",
+    "fetch_push_layout",
+    "fetch_push_reward",
+    "make_fetch_push_env",
+    "register_fetch_push",
+]
