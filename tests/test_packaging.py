@@ -54,6 +54,7 @@ CORE = (
     "torchrl_caiac",
     "torchrl_caiac.checkpoint",
     "torchrl_caiac.data",
+    "torchrl_caiac.evaluation",
     "torchrl_caiac.experiments",
     "torchrl_caiac.fit",
     "torchrl_caiac.influence",

@@ -269,7 +269,7 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw how influence estimators compare, one panel a measure.
 
     Args:
-        rows: of :func:`~torchrl_caiac.influence.compare_influence`, with the name of
+        rows: of :func:`~torchrl_caiac.evaluation.compare_influence`, with the name of
             the ``"experiment"`` in each; as numbers, or as strings of a CSV file. Only
             those over all entities are drawn; what is empty is left out.
 

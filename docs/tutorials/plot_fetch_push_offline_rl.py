@@ -187,8 +187,9 @@ for name in ("cube0", "cube1"):
     row = report[name]
     print(
         f"{name}: influenced in {row['influenced']:.0%} of the rows; ROC-AUC "
-        f"{row['auc']:.3f}; at {THRESHOLD} found {row['hit_rate']:.0%}, false alarms "
-        f"{row['false_alarms']:.0%}"
+        f"{row['auc']:.3f}; at {THRESHOLD} true positive rate "
+        f"{row['true_positive_rate']:.0%}, false positive rate "
+        f"{row['false_positive_rate']:.0%}"
     )
 
 # %%

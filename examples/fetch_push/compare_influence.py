@@ -18,15 +18,14 @@ from omegaconf import DictConfig
 from score import make_truth, simulator_truth
 
 from torchrl_caiac.data import load_transitions
-from torchrl_caiac.experiments import claim_folder, quick_settings
-from torchrl_caiac.influence import (
-    CAI,
+from torchrl_caiac.evaluation import (
     Candidate,
-    DistanceInfluence,
     compare_influence,
     paper_candidates,
     publish_comparison,
 )
+from torchrl_caiac.experiments import claim_folder, quick_settings
+from torchrl_caiac.influence import CAI, DistanceInfluence
 
 POSITIONS = {name: LAYOUT.columns[name][:3] for name in LAYOUT.names}
 

@@ -94,12 +94,11 @@ def report_table(
 ) -> str:
     """The table of one fraction of the data."""
     lines = ["", f"{100 * cfg.fraction:g} % of the data", "", "influence, unseen data"]
-    lines.append(
-        f"  {'':<20}{'AUC':>7}{'hit rate':>10}{'false alarms':>14}{'best θ':>8}"
-    )
+    lines.append(f"  {'':<20}{'AUC':>7}{'TPR':>10}{'FPR':>14}{'best θ':>8}")
     lines += [
-        f"  {f'{name}, {smoothing}':<20}{row['auc']:>7.3f}{row['hit_rate']:>10.3f}"
-        f"{row['false_alarms']:>14.3f}{row['best_threshold']:>8.3f}"
+        f"  {f'{name}, {smoothing}':<20}{row['auc']:>7.3f}"
+        f"{row['true_positive_rate']:>10.3f}"
+        f"{row['false_positive_rate']:>14.3f}{row['best_threshold']:>8.3f}"
         for smoothing, entities in influence.items()
         for name, row in entities.items()
         if name != "gripper"

@@ -22,16 +22,14 @@ from tensordict import TensorDictBase
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KitchenEnv
-from torchrl_caiac.experiments import claim_folder, quick_settings
-from torchrl_caiac.influence import (
-    CAI,
+from torchrl_caiac.evaluation import (
     Candidate,
-    DistanceInfluence,
-    SimulatorInfluence,
     compare_influence,
     paper_candidates,
     publish_comparison,
 )
+from torchrl_caiac.experiments import claim_folder, quick_settings
+from torchrl_caiac.influence import CAI, DistanceInfluence, SimulatorInfluence
 
 LAYOUT = KitchenEnv.layout
 # The observation has joints; the distance rule reads where hand and handles are.

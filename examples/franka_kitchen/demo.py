@@ -123,7 +123,7 @@ def report_table(
     lines = ["", "influence on unseen demonstrations"]
     lines.append(
         f"  {'entity':<22}{'AUC':>7}{'influenced':>12}{'score <= theta':>16}"
-        f"{'false -':>10}{'false +':>10}"
+        f"{'FNR':>10}{'FPR':>10}"
     )
     for name, row in influence.items():
         if name in KitchenEnv.layout.fixed:
@@ -132,11 +132,12 @@ def report_table(
             # There is neither where nothing influences the entity.
             ("-", "-")
             if math.isnan(row["auc"])
-            else (f"{row['auc']:.3f}", f"{1 - row['hit_rate']:.1%}")
+            else (f"{row['auc']:.3f}", f"{1 - row['true_positive_rate']:.1%}")
         )
         lines.append(
             f"  {name:<22}{auc:>7}{row['influenced']:>12.1%}"
-            f"{row['below_threshold']:>16.1%}{missed:>10}{row['false_alarms']:>10.1%}"
+            f"{row['below_threshold']:>16.1%}{missed:>10}"
+            f"{row['false_positive_rate']:>10.1%}"
         )
     lines += [
         "",

@@ -286,7 +286,7 @@ def test_estimators_are_compared_on_unseen_episodes(cfg, steps, tmp_path):
     ]
     totals = {r["estimator"]: r for r in rows if r["entity"] == "all"}
     # It asks about fewer of the same actions than the truth.
-    assert totals["oracle"]["false_alarms"] == 0
+    assert totals["oracle"]["false_positive_rate"] == 0
     assert totals["oracle"]["rows_swapped"] > 0.9
     assert totals["coda"]["auc"] == pytest.approx(totals["coda_action"]["auc"])
     for name in ("caiac", "coda", "coda_action"):

@@ -1,4 +1,4 @@
-"""What actions truly influence, asked of the simulator, and scores judged by it."""
+"""Ground truth of influence, from the simulator."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -22,15 +22,11 @@ if TYPE_CHECKING:
     from torchrl_caiac.entities import EntityLayout
 
 __all__ = [
-    "EntityReport",
     "InfluenceSimulator",
     "SimulatorInfluence",
     "TrueInfluence",
-    "best_threshold",
     "draw_actions",
-    "influence_report",
     "oracle_score",
-    "roc_auc",
     "true_influence",
 ]
 
@@ -76,21 +72,6 @@ class TrueInfluence(NamedTuple):
 
     influenced: torch.Tensor
     displacement: torch.Tensor
-
-
-class EntityReport(TypedDict):
-    """How well a score finds one entity's true influence.
-
-    Shares are ``nan`` where no row, or every row, is truly influenced.
-    """
-
-    auc: float
-    best_threshold: float
-    best_balanced_accuracy: float
-    hit_rate: float
-    false_alarms: float
-    influenced: float
-    below_threshold: float
 
 
 def draw_actions(
@@ -414,144 +395,3 @@ class SimulatorInfluence:
             f"num_actions={self.num_actions}, threshold={self.threshold}, "
             f"seed={self.seed})"
         )
-
-
-def _pair(score: Any, truth: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    values = np.asarray(score, dtype=np.float64)
-    mask = np.asarray(truth)
-    if values.ndim != 1 or mask.shape != values.shape:
-        raise ValueError(
-            f"score and truth have shapes {values.shape} and {mask.shape}, wanted the "
-            "same [S]"
-        )
-    if mask.dtype != np.bool_:
-        raise ValueError(f"truth has dtype {mask.dtype}, wanted bool")
-    if not len(values):
-        raise ValueError("score is empty")
-    bad = int((~np.isfinite(values)).sum())
-    if bad:
-        raise ValueError(
-            f"score is NaN (not scored) or infinite in {bad} rows: score them, or drop "
-            "them here"
-        )
-    return values, mask
-
-
-def roc_auc(score: ArrayLike | torch.Tensor, truth: ArrayLike | torch.Tensor) -> float:
-    """Return the area under the ROC curve of a score.
-
-    Args:
-        score: ``[S]``, finite; higher means more influence. Ties count half.
-        truth: bool ``[S]``.
-
-    Returns:
-        the probability that an influenced row scores above an uninfluenced one;
-        ``nan`` if the rows are all of one kind.
-
-    Example:
-        >>> roc_auc([0.1, 0.4, 0.35, 0.8], np.array([False, False, True, True]))
-        0.75
-    """
-    from scipy.stats import mannwhitneyu
-
-    values, mask = _pair(score, truth)
-    positive, negative = values[mask], values[~mask]
-    if not len(positive) or not len(negative):
-        return float("nan")
-    wins = mannwhitneyu(positive, negative, method="asymptotic").statistic
-    return float(wins / (len(positive) * len(negative)))
-
-
-def best_threshold(
-    score: ArrayLike | torch.Tensor, truth: ArrayLike | torch.Tensor
-) -> tuple[float, float]:
-    """Return the threshold of highest balanced accuracy.
-
-    Rows with a score above the threshold are called influenced; balanced accuracy is
-    the mean of hit rate and one minus false alarms. Among equally good thresholds the
-    one in the middle of the widest gap between scores is taken.
-
-    Args:
-        score: ``[S]``, finite.
-        truth: bool ``[S]``.
-
-    Returns:
-        threshold and its balanced accuracy; ``(nan, nan)`` if the rows are all of one
-        kind.
-
-    Example:
-        >>> best_threshold([0.0, 0.1, 0.5, 0.6], np.array([False, False, True, True]))
-        (0.3, 1.0)
-    """
-    values, mask = _pair(score, truth)
-    positives = int(mask.sum())
-    negatives = len(mask) - positives
-    if not positives or not negatives:
-        return float("nan"), float("nan")
-    levels, inverse = np.unique(values, return_inverse=True)
-    # Cutting above level i: what lies at or below it is called uninfluenced. The last
-    # cut calls nothing influenced.
-    misses = np.cumsum(np.bincount(inverse, weights=mask))
-    rejected = np.cumsum(np.bincount(inverse, weights=~mask))
-    accuracy = ((1 - misses / positives) + rejected / negatives) / 2
-    gaps = np.append(np.diff(levels), 0.0)
-    best = int(np.lexsort((gaps, accuracy))[-1])
-    middle = (levels[best] + levels[min(best + 1, len(levels) - 1)]) / 2
-    return float(middle), float(accuracy[best])
-
-
-def influence_report(
-    scores: ArrayLike | torch.Tensor,
-    truth: ArrayLike | torch.Tensor,
-    names: Sequence[str],
-    threshold: float,
-) -> dict[str, EntityReport]:
-    """Judge a score by the truth, entity by entity.
-
-    Args:
-        scores: ``[S, N]``, finite.
-        truth: bool ``[S, N]``, of :func:`true_influence`.
-        names: the ``N`` entities.
-        threshold: θ; influenced is what scores above it.
-
-    Returns:
-        per entity: ``auc``; ``best_threshold`` and ``best_balanced_accuracy``
-        (:func:`best_threshold`); at θ the ``hit_rate`` (influenced rows called so)
-        and ``false_alarms`` (uninfluenced rows called influenced); ``influenced``, the
-        share of rows that truly are; ``below_threshold``, the share of rows at or
-        under θ.
-
-    Example:
-        >>> truth = np.array([[True, False], [False, False]])
-        >>> report = influence_report(
-        ...     [[0.9, 0.1], [0.0, 0.0]], truth, ["kettle", "microwave"], 0.3
-        ... )
-        >>> report["kettle"]["auc"], report["microwave"]["below_threshold"]
-        (1.0, 1.0)
-    """
-    values, mask = np.asarray(scores, dtype=np.float64), np.asarray(truth)
-    wanted = (len(values), len(names))
-    if values.shape != wanted or mask.shape != wanted:
-        raise ValueError(
-            f"scores and truth have shapes {values.shape} and {mask.shape}, wanted "
-            f"[S, {len(names)}] for the entities {tuple(names)}"
-        )
-    report: dict[str, EntityReport] = {}
-    for i, name in enumerate(names):
-        score, own = _pair(values[:, i], mask[:, i])
-        called = score > threshold
-        best, accuracy = best_threshold(score, own)
-        report[name] = EntityReport(
-            auc=roc_auc(score, own),
-            best_threshold=best,
-            best_balanced_accuracy=accuracy,
-            hit_rate=_share(called, own),
-            false_alarms=_share(called, ~own),
-            influenced=float(own.mean()),
-            below_threshold=float(1 - called.mean()),
-        )
-    return report
-
-
-def _share(called: NDArray[np.bool_], among: NDArray[np.bool_]) -> float:
-    return float(called[among].mean()) if among.any() else float("nan")

@@ -16,8 +16,8 @@ from tensordict import TensorDictBase
 from torchrl_caiac.data.offline_buffer import offline_buffer
 from torchrl_caiac.experiments import update_csv, whole_file
 from torchrl_caiac.influence.attention import AttentionInfluence
+from torchrl_caiac.influence.metrics import influence_report
 from torchrl_caiac.influence.score_buffer import score_buffer
-from torchrl_caiac.influence.truth import influence_report
 
 if TYPE_CHECKING:
     from torchrl_caiac.influence.cai import CAI
@@ -36,7 +36,7 @@ __all__ = [
     "swap_shares",
 ]
 
-_JUDGED = ("auc", "hit_rate", "false_alarms", "best_threshold")
+_JUDGED = ("auc", "true_positive_rate", "false_positive_rate", "best_threshold")
 #: What :func:`compare_influence` reports, in the order of the published table.
 COLUMNS = (
     "estimator",
@@ -103,7 +103,8 @@ def paper_candidates(
     Examples:
         >>> from functools import partial
         >>> from torchrl_caiac import EntityLayout
-        >>> from torchrl_caiac.influence import CAI, DistanceInfluence, paper_candidates
+        >>> from torchrl_caiac.influence import CAI, DistanceInfluence
+        >>> from torchrl_caiac.evaluation import paper_candidates
         >>> from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
         >>> layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
         >>> rule = partial(DistanceInfluence, layout, {"arm": [0], "cup": [1]})
@@ -191,7 +192,7 @@ def swap_shares(
     Examples:
         >>> import torch
         >>> from torchrl_caiac import CAIACTransform, EntityLayout
-        >>> from torchrl_caiac.influence.comparison import swap_shares
+        >>> from torchrl_caiac.evaluation import swap_shares
         >>> layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
         >>> truth = torch.tensor([[True, False], [True, True]]).repeat(50, 1)
         >>> swap_shares(CAIACTransform(layout), truth.float(), truth).infeasible_total
@@ -255,9 +256,10 @@ def compare_influence(
     Returns:
         list of dict: for each estimator one with ``"entity": "all"``, and one for each
         entity that may be swapped. All have ``"estimator"``; ``"threshold"``, θ;
-        ``"auc"``, ``"hit_rate"``, ``"false_alarms"`` and ``"best_threshold"`` of the
-        action's influence (:func:`~torchrl_caiac.influence.influence_report`; for all,
-        the mean over entities that have an AUC); and ``"infeasible"``, the share of
+        ``"auc"``, ``"true_positive_rate"``, ``"false_positive_rate"`` and
+        ``"best_threshold"`` of the action's influence
+        (:func:`~torchrl_caiac.influence.influence_report`; for all, the mean over
+        entities that have an AUC); and ``"infeasible"``, the share of
         swaps (:func:`swap_shares`). For all, also ``"density"``, the share of links
         above θ among those that the estimator scores; ``"rows_swapped"``;
         ``"fit_seconds"``; and ``"score_seconds"``, processor time for all rows.
@@ -267,7 +269,7 @@ def compare_influence(
         >>> from tensordict import TensorDict
         >>> from torchrl_caiac import CAIACTransform, EntityLayout
         >>> from torchrl_caiac.influence import DistanceInfluence
-        >>> from torchrl_caiac.influence.comparison import Candidate, compare_influence
+        >>> from torchrl_caiac.evaluation import Candidate, compare_influence
         >>> layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
         >>> rule = DistanceInfluence(layout, {"arm": [0], "cup": [1]}, action_only=True)
         >>> state = torch.rand(60, 2)
@@ -356,7 +358,7 @@ def publish_comparison(
 
     Examples:
         >>> import os, tempfile
-        >>> from torchrl_caiac.influence import publish_comparison
+        >>> from torchrl_caiac.evaluation import publish_comparison
         >>> row = {"estimator": "caiac", "entity": "all", "auc": 0.9}
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     publish_comparison(folder, [row], experiment="pushing")
@@ -378,8 +380,8 @@ def publish_comparison(
 _READ = {
     "threshold": "θ",
     "auc": "AUC",
-    "hit_rate": "hit rate",
-    "false_alarms": "false alarms",
+    "true_positive_rate": "TPR",
+    "false_positive_rate": "FPR",
     "density": "links > θ",
     "rows_swapped": "rows swapped",
     "infeasible": "infeasible",

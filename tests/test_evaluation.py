@@ -13,15 +13,14 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
-from torchrl_caiac.influence import (
-    CAI,
+from torchrl_caiac.evaluation import (
     Candidate,
-    DistanceInfluence,
     compare_influence,
     paper_candidates,
     publish_comparison,
     swap_shares,
 )
+from torchrl_caiac.influence import CAI, DistanceInfluence
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 
 NAMES = ("arm", "cup", "box")
@@ -155,11 +154,11 @@ def test_estimators_are_compared_on_the_same_rows():
     )
     by_name = {(r["estimator"], r["entity"]): r for r in table}
     row, cup, box = (by_name["row", entity] for entity in ("all", "cup", "box"))
-    assert row["auc"] == cup["auc"] == cup["hit_rate"] == 1
+    assert row["auc"] == cup["auc"] == cup["true_positive_rate"] == 1
     assert math.isnan(box["auc"])
     high = data["observation"][:, 1:] > 0.5
     assert row["density"] == pytest.approx(high.float().mean())
-    assert box["false_alarms"] == pytest.approx(high[:, 1].float().mean())
+    assert box["false_positive_rate"] == pytest.approx(high[:, 1].float().mean())
     assert row["infeasible"] == 0
     assert row["fit_seconds"] == 12 and row["score_seconds"] >= 0
     assert by_name["smooth", "all"]["auc"] < 1
