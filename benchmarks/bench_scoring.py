@@ -35,19 +35,16 @@ from tensordict import TensorDict
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from benchmarks.ratios import seconds
-from torchrl_caiac.data import (
-    create_kitchen_play,
-    create_kitchen_random,
-    kitchen_transitions,
-    load_minari,
-    mix_trajectories,
-)
+from torchrl_caiac.data import load_minari, mix_trajectories
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.envs import (
     KitchenEnv,
     create_fetch_push_expert,
     create_fetch_push_random,
+    create_kitchen_play,
+    create_kitchen_random,
     fetch_push_layout,
+    kitchen_transitions,
 )
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import CAI, causal_action_influence, score_buffer

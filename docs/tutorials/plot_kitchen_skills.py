@@ -22,17 +22,15 @@ from tensordict import TensorDict
 from torchrl.data import SliceSampler, TensorDictReplayBuffer
 
 from torchrl_caiac import CAIACTransform
-from torchrl_caiac.data import (
+from torchrl_caiac.data import offline_buffer
+from torchrl_caiac.envs import RenderingUnavailable
+from torchrl_caiac.envs.kitchen import (
+    KITCHEN_TASKS,
+    MICROWAVE_KETTLE,
+    KitchenEnv,
     create_kitchen_demonstrations,
     create_kitchen_random,
     kitchen_transitions,
-    offline_buffer,
-)
-from torchrl_caiac.data.kitchen_datasets import MICROWAVE_KETTLE
-from torchrl_caiac.envs import (
-    KITCHEN_TASKS,
-    KitchenEnv,
-    RenderingUnavailable,
     make_kitchen_env,
 )
 from torchrl_caiac.fit import fit_world_model

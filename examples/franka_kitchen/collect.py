@@ -14,17 +14,15 @@ import hydra
 from minari import MinariDataset
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_caiac.data import (
-    create_kitchen_demonstrations,
-    create_kitchen_play,
-    create_kitchen_random,
-    kitchen_transitions,
-)
-from torchrl_caiac.data.kitchen_datasets import (
+from torchrl_caiac.envs.kitchen import (
     DEMONSTRATIONS_ID,
     MICROWAVE_KETTLE,
     PLAY_ID,
     RANDOM_ID,
+    create_kitchen_demonstrations,
+    create_kitchen_play,
+    create_kitchen_random,
+    kitchen_transitions,
 )
 from torchrl_caiac.experiments import keep_settings
 

@@ -13,8 +13,8 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-from torchrl_caiac.data import create_kitchen_play, load_transitions
-from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv
+from torchrl_caiac.data import load_transitions
+from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv, create_kitchen_play
 
 FOLDER = Path(__file__).parents[2] / "examples" / "franka_kitchen"
 ARMS = ["none", "caiac", "coda", "coda_action", "oracle"]

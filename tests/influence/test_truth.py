@@ -16,7 +16,7 @@ from torchrl_caiac.envs.fetch_push import (
     FetchPushTruth,
 )
 from torchrl_caiac.envs.kitchen import KitchenEnv
-from torchrl_caiac.envs.kitchen_expert import KitchenExpert
+from torchrl_caiac.envs.kitchen.expert import KitchenExpert
 from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,

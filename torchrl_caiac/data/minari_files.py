@@ -1,7 +1,6 @@
 """Local Minari datasets: where they lie, and how they are written whole or not at all.
 
-What the makers of datasets share: :mod:`~torchrl_caiac.data.kitchen_datasets` and
-:mod:`~torchrl_caiac.envs.fetch_push.datasets`.
+Shared by the dataset creators of :mod:`torchrl_caiac.envs`.
 """
 
 from __future__ import annotations

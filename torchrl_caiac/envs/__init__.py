@@ -18,12 +18,18 @@ from torchrl_caiac.envs.fetch_push import (
 from torchrl_caiac.envs.kitchen import (
     KITCHEN_ENV_ID,
     KITCHEN_TASKS,
+    KitchenChain,
     KitchenEnv,
+    KitchenExpert,
     KitchenState,
+    create_kitchen_demonstrations,
+    create_kitchen_play,
+    create_kitchen_random,
     kitchen_reward,
+    kitchen_transitions,
+    load_d4rl_kitchen,
     make_kitchen_env,
 )
-from torchrl_caiac.envs.kitchen_expert import KitchenChain, KitchenExpert
 from torchrl_caiac.envs.rendering import RenderingUnavailable
 
 __all__ = [
@@ -41,10 +47,15 @@ __all__ = [
     "RenderingUnavailable",
     "create_fetch_push_expert",
     "create_fetch_push_random",
+    "create_kitchen_demonstrations",
+    "create_kitchen_play",
+    "create_kitchen_random",
     "fetch_push_distances",
     "fetch_push_layout",
     "fetch_push_reward",
     "kitchen_reward",
+    "kitchen_transitions",
+    "load_d4rl_kitchen",
     "make_fetch_push_env",
     "make_kitchen_env",
 ]

@@ -58,7 +58,7 @@ __all__ = [
     "load_d4rl_kitchen",
 ]
 
-logger = logging.getLogger("torchrl_caiac.data.kitchen_datasets")
+logger = logging.getLogger("torchrl_caiac.envs.kitchen.datasets")
 
 DEMONSTRATIONS_ID = "kitchen/microwave-kettle-v0"
 PLAY_ID = "kitchen/play-v0"
@@ -288,7 +288,7 @@ def create_kitchen_play(
 
 
 def _check_tasks(names: Sequence[str]) -> None:
-    from torchrl_caiac.envs.kitchen_expert import TASKS
+    from torchrl_caiac.envs.kitchen.expert import TASKS
 
     for name in names:
         if name not in TASKS:
@@ -328,7 +328,7 @@ def _create(
         buffers,
         target,
         lambda: _make_env(factory.tasks),
-        code="torchrl_caiac/data/kitchen_datasets.py",
+        code="torchrl_caiac/envs/kitchen/datasets.py",
         progress=progress,
         description=description,
         algorithm_name="torchrl_caiac scripted expert",
@@ -433,7 +433,7 @@ def create_kitchen_random(
         buffers,
         target,
         lambda: _make_env(_TASKS),
-        code="torchrl_caiac/data/kitchen_datasets.py",
+        code="torchrl_caiac/envs/kitchen/datasets.py",
         progress=progress,
         description=(
             f"{steps} uniformly random actions from each of {total} states of "
@@ -486,7 +486,7 @@ def kitchen_transitions(
     """
     import torch
 
-    from torchrl_caiac.envs.kitchen import KITCHEN_TASKS
+    from torchrl_caiac.envs.kitchen.env import KITCHEN_TASKS
 
     _check_free(path, overwrite)
     if isinstance(dataset, str):
@@ -711,7 +711,7 @@ class _ExpertSource:
         self.experts: dict[str, Any] = {}
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
-        from torchrl_caiac.envs.kitchen_expert import KitchenExpert, set_kitchen_start
+        from torchrl_caiac.envs.kitchen.expert import KitchenExpert, set_kitchen_start
 
         self.env.reset(seed=seed)
         observation = set_kitchen_start(self.env, spec["start"])
@@ -759,8 +759,8 @@ class _PlaySource:
         self.chain: Any = None
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any] | None:
-        from torchrl_caiac.envs.kitchen import KITCHEN_TASKS
-        from torchrl_caiac.envs.kitchen_expert import (
+        from torchrl_caiac.envs.kitchen.env import KITCHEN_TASKS
+        from torchrl_caiac.envs.kitchen.expert import (
             TASKS,
             KitchenChain,
             set_kitchen_start,
@@ -824,7 +824,7 @@ class _RandomSource:
         self.states = states
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any]:
-        from torchrl_caiac.envs.kitchen_expert import set_kitchen_start
+        from torchrl_caiac.envs.kitchen.expert import set_kitchen_start
 
         rng = np.random.default_rng([seed, 1])
         data = self.env.unwrapped.robot_env.data

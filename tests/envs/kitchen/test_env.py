@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs import SerialEnv, check_env_specs
 
-from torchrl_caiac.envs.kitchen import (
+from torchrl_caiac.envs.kitchen.env import (
     KITCHEN_ENV_ID,
     KITCHEN_TASKS,
     KitchenEnv,

@@ -9,7 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchrl_caiac.envs.inverse_kinematics import InverseKinematics, rotation_vector
+from torchrl_caiac.envs.kitchen.inverse_kinematics import (
+    InverseKinematics,
+    rotation_vector,
+)
 
 ARM = """
 <mujoco>

@@ -13,9 +13,9 @@ from gymnasium_robotics.envs.franka_kitchen.kitchen_env import (
     OBS_ELEMENT_INDICES,
 )
 
-from torchrl_caiac.envs import kitchen_expert
-from torchrl_caiac.envs.kitchen import KitchenEnv
-from torchrl_caiac.envs.kitchen_expert import (
+from torchrl_caiac.envs.kitchen import expert
+from torchrl_caiac.envs.kitchen.env import KitchenEnv
+from torchrl_caiac.envs.kitchen.expert import (
     TASKS,
     KitchenChain,
     KitchenExpert,
@@ -450,16 +450,16 @@ def test_bad_input(env):
 
 def test_main_measures(caplog, capsys):
     with caplog.at_level("INFO"):
-        code = kitchen_expert.main(["--task", "all", "--episodes", "1"])
+        code = expert.main(["--task", "all", "--episodes", "1"])
     assert code == 0
     for name in TASKS:
         assert f"{name}: 1 of 1 episodes" in caplog.text
     with caplog.at_level("INFO"):
-        code = kitchen_expert.main(
+        code = expert.main(
             ["--chain", "2", "--episodes", "1", "--random-start", "--verbose"]
         )
     assert code == 0
     assert "chains of 2: 1 of 1" in caplog.text
     with pytest.raises(SystemExit):
-        kitchen_expert.main(["--task", "kettle", "--episodes", "0"])
+        expert.main(["--task", "kettle", "--episodes", "0"])
     assert "--episodes is 0" in capsys.readouterr().err

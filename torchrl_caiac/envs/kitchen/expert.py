@@ -6,7 +6,7 @@ the actions. A task is a table: another task is another entry of `TASKS`.
 
 `KitchenChain` plays several of them in a row.
 
-`python -m torchrl_caiac.envs.kitchen_expert --task all --episodes 50` measures the
+`python -m torchrl_caiac.envs.kitchen.expert --task all --episodes 50` measures the
 tasks, `--chain 4 --episodes 30 [--random-start]` chains of four in random order.
 """
 
@@ -21,12 +21,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from torchrl_caiac.envs.inverse_kinematics import InverseKinematics, rotation_vector
+from torchrl_caiac.envs.kitchen.inverse_kinematics import (
+    InverseKinematics,
+    rotation_vector,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from torchrl_caiac.envs.kitchen import KitchenEnv
+    from torchrl_caiac.envs.kitchen.env import KitchenEnv
 
 __all__ = [
     "TASKS",
@@ -39,7 +42,7 @@ __all__ = [
     "tool_rotation",
 ]
 
-logger = logging.getLogger("torchrl_caiac.envs.kitchen_expert")
+logger = logging.getLogger("torchrl_caiac.envs.kitchen.expert")
 
 ARM_JOINTS = tuple(f"robot:panda0_joint{i}" for i in range(1, 8))
 TOOL_SITE = "end_effector"
@@ -1098,7 +1101,7 @@ def _measure_task(env: Any, name: str, options: argparse.Namespace) -> int:
 
 def _measure_chains(env: Any, options: argparse.Namespace) -> int:
     """Play chains in random order, say how they went, return the successful ones."""
-    from torchrl_caiac.envs.kitchen import KitchenEnv
+    from torchrl_caiac.envs.kitchen.env import KitchenEnv
 
     kitchen = KitchenEnv()
     names = list(TASKS)

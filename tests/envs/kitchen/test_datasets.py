@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from minari.data_collector import EpisodeBuffer
 from tensordict import TensorDict
 
-from torchrl_caiac.data.kitchen_datasets import (
+from torchrl_caiac.data.minari_files import open_minari
+from torchrl_caiac.envs.kitchen.datasets import (
     DEMONSTRATIONS_ID,
     PLAY_ID,
     PLAY_ORDERS,
@@ -29,8 +30,7 @@ from torchrl_caiac.data.kitchen_datasets import (
     kitchen_transitions,
     load_d4rl_kitchen,
 )
-from torchrl_caiac.data.minari_files import open_minari
-from torchrl_caiac.envs.kitchen import KITCHEN_TASKS, KitchenEnv
+from torchrl_caiac.envs.kitchen.env import KITCHEN_TASKS, KitchenEnv
 
 GROUPS = (
     Demonstrations("microwave", 1, {"slide_cabinet": 0.37}),
