@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
-__all__ = ["draw_numbers"]
+__all__ = ["draw_integers", "draw_numbers"]
+
+_RANDOM_BITS = 1 << 62
 
 
 def draw_numbers(
@@ -47,3 +49,33 @@ def draw_numbers(
     pinned = source.type == "cpu" and device.type == "cuda"
     drawn = kind(*args, generator=generator, device=source, pin_memory=pinned, **kwargs)
     return drawn.to(device, non_blocking=pinned)
+
+
+def draw_integers(
+    shape: Sequence[int],
+    *,
+    device: torch.device,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Random integers so large that their remainders are uniform for all purposes.
+
+    Args:
+        shape (sequence of int): the shape.
+
+    Keyword Args:
+        device (torch.device): where they are needed.
+        generator (torch.Generator, optional): where they come from.
+
+    Returns:
+        torch.Tensor: int64, from 0 to 2**62.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac._random import draw_integers
+        >>> draw = draw_integers((4,), device=torch.device("cpu"))
+        >>> bool((draw % 3 < 3).all())
+        True
+    """
+    return draw_numbers(
+        torch.randint, _RANDOM_BITS, shape, device=device, generator=generator
+    )

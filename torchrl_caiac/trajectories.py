@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import weakref
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -10,9 +11,9 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac._keys import missing_key
-from torchrl_caiac._torchrl import last_written, storage_data
+from torchrl_caiac._torchrl import last_written, storage_data, storage_revision
 
-__all__ = ["TrajectoryIndex", "trajectory_index"]
+__all__ = ["TrajectoryCache", "TrajectoryIndex", "trajectory_index"]
 
 # Where TorchRL's collectors store trajectory ids.
 _COLLECTOR_KEY: NestedKey = ("collector", "traj_ids")
@@ -163,6 +164,59 @@ def trajectory_index(
         part = left[start : start + _CHUNK]
         part -= torch.arange(start, start + len(part), dtype=dtype, device=left.device)
     return TrajectoryIndex(length, oldest, ends, left.roll(oldest) if oldest else left)
+
+
+class TrajectoryCache:
+    """Keeps the index of a storage until the storage is written to.
+
+    Keyword Args:
+        trajectory_key (NestedKey, optional): see :func:`trajectory_index`.
+        done_key (NestedKey, optional): see :func:`trajectory_index`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> from torchrl_caiac.trajectories import TrajectoryCache
+        >>> cache = TrajectoryCache(trajectory_key="episode", done_key=None)
+        >>> storage = LazyTensorStorage(4)
+        >>> storage.set(range(2), TensorDict({"episode": torch.zeros(2)}, [2]))
+        >>> cache.get(storage) is cache.get(storage)
+        True
+    """
+
+    def __init__(
+        self, *, trajectory_key: NestedKey | None, done_key: NestedKey | None
+    ) -> None:
+        self.trajectory_key = trajectory_key
+        self.done_key = done_key
+        self._built: tuple[Any, tuple[Any, ...], TrajectoryIndex] | None = None
+
+    def get(self, storage: TensorStorage) -> TrajectoryIndex:
+        """Returns the index of the storage as it is now.
+
+        Args:
+            storage (TensorStorage): the storage.
+
+        Returns:
+            TrajectoryIndex: see :func:`trajectory_index`, also for what is raised.
+        """
+        built, revision = self._built, storage_revision(storage)
+        if built is None or built[0]() is not storage or built[1] != revision:
+            index = trajectory_index(
+                storage, trajectory_key=self.trajectory_key, done_key=self.done_key
+            )
+            self._built = built = (weakref.ref(storage), revision, index)
+        return built[2]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _new_cache, (self.trajectory_key, self.done_key)
+
+
+def _new_cache(
+    trajectory_key: NestedKey | None, done_key: NestedKey | None
+) -> TrajectoryCache:
+    return TrajectoryCache(trajectory_key=trajectory_key, done_key=done_key)
 
 
 def _leaves(

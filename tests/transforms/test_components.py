@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from torchrl.data import ReplayBuffer
 
 from tests.transforms.test_donors import storages
+from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms import components as module
 from torchrl_caiac.transforms.components import (
     ComponentIndex,
@@ -21,7 +22,6 @@ from torchrl_caiac.transforms.components import (
     draw_batch_components,
     draw_buffer_components,
 )
-from torchrl_caiac.transforms.donors import trajectory_index
 
 THRESHOLD = 0.3
 

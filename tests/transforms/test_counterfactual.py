@@ -9,11 +9,17 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.transforms import CAIACTransform, CoDATransform
+from torchrl_caiac.transforms import (
+    CAIACTransform,
+    CoDATransform,
+    HindsightGoal,
+    TransformKeys,
+)
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
-from torchrl_caiac.transforms.donors import SwapDraw
+from torchrl_caiac.transforms.draws import SwapDraw
 
 LAYOUT = EntityLayout({"cup": [0], "lid": [1]})
+KEYS = TransformKeys(trajectory="run")
 SETTINGS: dict[str, Any] = {
     "threshold": 0.1,
     "counterfactual_ratio": 0.5,
@@ -22,14 +28,9 @@ SETTINGS: dict[str, Any] = {
     "donors": None,
     "score_key": "age",
     "reward_fn": None,
-    "reward_key": ("next", "reward"),
     "goals": None,
     "generator": None,
-    "counterfactual_key": ("caiac", "counterfactual"),
-    "swapped_key": ("caiac", "swapped"),
-    "relabeled_key": ("hindsight", "relabeled"),
-    "trajectory_key": "episode",
-    "done_key": ("next", "done"),
+    "keys": KEYS,
     "check": True,
 }
 
@@ -83,6 +84,52 @@ def test_both_augmentations_take_the_same_options(transform: Any) -> None:
     for name, value in options.items():
         if name != "goals":
             assert getattr(made, name) == value
-    other = transform(LAYOUT)
-    assert other.counterfactual_key == made.counterfactual_key
-    assert other.swapped_key == made.swapped_key
+    assert transform(LAYOUT).keys == TransformKeys()
+
+
+@pytest.mark.parametrize("transform", [CAIACTransform, CoDATransform])
+def test_arguments_beyond_the_third_are_named(transform: Any) -> None:
+    made = transform(LAYOUT, 0.1, 0.25)
+    assert (made.threshold, made.counterfactual_ratio) == (0.1, 0.25)
+    with pytest.raises(TypeError, match="positional"):
+        transform(LAYOUT, 0.1, 0.25, 1)
+
+
+def test_keys_that_are_read_and_written() -> None:
+    goal = EntityLayout(
+        {"cup": [0], "lid": [1]},
+        goal={"cup": [0], "lid": ()},
+        achieved={"cup": [0], "lid": ()},
+    )
+    state = ["observation", ("next", "observation")]
+    made = CAIACTransform(LAYOUT, score_key="age")
+    flags = [("caiac", "counterfactual"), ("caiac", "swapped")]
+    assert made.in_keys == [*state, "age"] and made.out_keys == [*state, *flags]
+    goals = ["achieved_goal", ("next", "achieved_goal")]
+    goals += ["desired_goal", ("next", "desired_goal")]
+    made = CAIACTransform(goal, reward_fn=min, keys=TransformKeys(reward="r"))
+    assert made.in_keys == [*state, *goals, ("caiac", "score"), "r"]
+    assert made.out_keys == [*state, *goals, "r", *flags]
+    relabel = HindsightGoal(goal, min)
+    assert relabel.in_keys[:2] == [("next", "observation"), "desired_goal"]
+    assert relabel.out_keys[-1] == ("hindsight", "relabeled")
+
+
+@pytest.mark.parametrize(
+    ("transform", "scores"),
+    [(CAIACTransform, ("caiac", "score")), (CoDATransform, ("coda", "graph"))],
+)
+def test_hindsight_goals_come_after_the_augmentation(
+    transform: Any, scores: Any
+) -> None:
+    layout = EntityLayout({"cup": [0], "lid": [1]}, goal={"cup": [0], "lid": [1]})
+    made, td = transform(layout), batch()
+    td[scores] = torch.zeros(4, *made.feature_shape)
+    td["next", "achieved_goal"] = td["next", "observation"]
+    td["desired_goal"] = torch.zeros(4, 2)
+    td["next", "reward"] = torch.zeros(4, 1)
+    relabel = HindsightGoal(layout, lambda a, d: (a - d).sum(-1), future=0.0)
+    assert relabel(made(td))["hindsight", "relabeled"].shape == (4, 1)
+    expected = f"append {transform.__name__} first, HindsightGoal after it"
+    with pytest.raises(RuntimeError, match=expected):
+        made(relabel(td))

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from torchrl_caiac.transforms.caiac import CAIACTransform
 from torchrl_caiac.transforms.coda import CoDATransform
-from torchrl_caiac.transforms.hindsight_goal import HindsightGoal
-from torchrl_caiac.transforms.window_goal import WindowGoal
+from torchrl_caiac.transforms.goals import HindsightGoal, WindowGoal
+from torchrl_caiac.transforms.keys import TransformKeys
 
-__all__ = ["CAIACTransform", "CoDATransform", "HindsightGoal", "WindowGoal"]
+__all__ = [
+    "CAIACTransform",
+    "CoDATransform",
+    "HindsightGoal",
+    "TransformKeys",
+    "WindowGoal",
+]

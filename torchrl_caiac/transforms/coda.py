@@ -14,8 +14,9 @@ from torchrl_caiac.transforms.components import (
     draw_batch_components,
 )
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
-from torchrl_caiac.transforms.donors import RewardFn
-from torchrl_caiac.transforms.window_goal import WindowGoal
+from torchrl_caiac.transforms.goals.window import WindowGoal
+from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.rewards import RewardFn
 
 __all__ = ["CoDATransform"]
 
@@ -25,55 +26,43 @@ class CoDATransform(CounterfactualTransform):
 
     The baseline of Pitis et al. (2020) that the paper compares with. Each row carries
     a graph of local influence, from the entities and the action to the entities (see
-    :class:`~torchrl_caiac.influence.AttentionInfluence`). Links are scores above
-    ``threshold``, whatever their direction, and fall into connected components. In the
-    last ``round(counterfactual_ratio * B)`` rows of a batch, every component that does
-    not hold the action takes its states and next states from a donor row in which the
-    very same set of entities is a component that does not hold the action either.
-    Components draw their donors independently; the entities of one component share
-    theirs. With ``window`` κ > 1, entities belong together that are linked in any row
-    of the window.
+    :class:`~torchrl_caiac.influence.AttentionInfluence`). Scores above ``threshold``
+    are links, in either direction, and links form connected components. In the last
+    ``round(counterfactual_ratio * B)`` rows of a batch, every component that does not
+    contain the action takes its states and next states from a donor row in which the
+    same set of entities is a component without the action too. Components draw their
+    donors independently; the entities of one component share theirs. With ``window``
+    κ > 1, entities belong together if they are linked in any row of the window.
 
-    A component that holds a ``fixed`` entity is not swapped. Goals, rewards, marks,
-    checks, donors in the batch or from a buffer, rows that were not scored, and what
-    happens where there is no donor: all as in
-    :class:`~torchrl_caiac.CAIACTransform`, which with the action's row alone
-    (``AttentionInfluence(model, action_only=True)``) is CoDA-action.
+    A component that contains a ``fixed`` entity is not swapped. Goals, rewards, flags,
+    checks, donors in the batch or from a buffer, unscored rows, missing donors and the
+    order of transforms: all as in :class:`~torchrl_caiac.CAIACTransform`, which with
+    the scores of the action alone (``AttentionInfluence(model, action_only=True)``) is
+    CoDA-action.
 
     Args:
         layout (EntityLayout): at most 64 entities.
         threshold (float): the largest score of what is no link, θ. Defaults to 0.2.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual, in [0, 1]. Defaults to 0.5.
-        window (int): rows a window, κ. Defaults to 1.
-        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn, by
-            default among the rows of the same batch. Pickling the transform pickles
-            it.
-        graph_key (NestedKey): the graphs, ``[*, N + 1, N]``: from the row (the
-            entities in layout order, then the action) to the column. Defaults to
-            ``("coda", "graph")``.
 
     Keyword Args:
         swap_prob (float): probability of swapping each component. Defaults to 1.
+        window (int): rows in a window, κ. Defaults to 1.
+        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn.
+            Defaults to the rows of the same batch. Pickling the transform pickles it.
+        graph_key (NestedKey): the graphs, ``[*, N + 1, N]``: from the row (the
+            entities in layout order, then the action) to the column. Defaults to
+            ``("coda", "graph")``.
         reward_fn (callable, optional): ``(next_achieved [C, G], desired [C, G])`` to
             rewards ``[C]`` or ``[C, 1]``; recomputes the rewards of counterfactual
-            rows.
-        reward_key (NestedKey): the rewards. Defaults to ``("next", "reward")``.
+            rows. Defaults to none: rewards stay as they are stored.
         goals (WindowGoal, optional): draws the goals of donor windows of a donor
             buffer; without it they are the stored ones.
-        generator (torch.Generator, optional): source of randomness; torch's default
-            generator without it. The same state gives the same batch.
-        counterfactual_key (NestedKey): the mark of counterfactual rows, bool
-            ``[B * κ, 1]``. Defaults to ``("caiac", "counterfactual")``.
-        swapped_key (NestedKey): the mark of swapped entities, bool ``[B * κ, N]``.
-            Defaults to ``("caiac", "swapped")``.
-        relabeled_key (NestedKey): the mark of a
-            :class:`~torchrl_caiac.transforms.HindsightGoal` that was appended before.
-            Defaults to ``("hindsight", "relabeled")``.
-        trajectory_key (NestedKey): trajectory ids, to check that windows do not cross
-            trajectories and to find donor windows. Defaults to ``"episode"``.
-        done_key (NestedKey): end flags, read where there are no ids. Defaults to
-            ``("next", "done")``.
+        generator (torch.Generator, optional): source of randomness. Defaults to
+            torch's default generator. The same state gives the same batch.
+        keys (TransformKeys, optional): rewards, trajectory ids, end flags and the
+            flags that are written. Defaults to ``TransformKeys()``.
         check (bool): check the values of each batch: graphs, windows, observations;
             on a CUDA device an error comes with a later sample. Defaults to ``True``.
 
@@ -109,8 +98,6 @@ class CoDATransform(CounterfactualTransform):
 
     draw_in_batch = staticmethod(draw_batch_components)
     donors_class = ComponentDonors
-    _what = "graphs"
-    _key_argument = "graph_key"
     _wanted = "a score from each entity and the action to each of"
 
     def __init__(
@@ -118,45 +105,35 @@ class CoDATransform(CounterfactualTransform):
         layout: EntityLayout,
         threshold: float = 0.2,
         counterfactual_ratio: float = 0.5,
+        *,
+        swap_prob: float = 1.0,
         window: int = 1,
         donors: ReplayBuffer | TensorStorage | None = None,
         graph_key: NestedKey = ("coda", "graph"),
-        *,
-        swap_prob: float = 1.0,
         reward_fn: RewardFn | None = None,
-        reward_key: NestedKey = ("next", "reward"),
         goals: WindowGoal | None = None,
         generator: torch.Generator | None = None,
-        counterfactual_key: NestedKey = ("caiac", "counterfactual"),
-        swapped_key: NestedKey = ("caiac", "swapped"),
-        relabeled_key: NestedKey = ("hindsight", "relabeled"),
-        trajectory_key: NestedKey = "episode",
-        done_key: NestedKey = ("next", "done"),
+        keys: TransformKeys | None = None,
         check: bool = True,
     ) -> None:
         super().__init__(
             layout,
-            threshold=threshold,
-            counterfactual_ratio=counterfactual_ratio,
+            threshold,
+            counterfactual_ratio,
             swap_prob=swap_prob,
             window=window,
             donors=donors,
             score_key=graph_key,
             reward_fn=reward_fn,
-            reward_key=reward_key,
             goals=goals,
             generator=generator,
-            counterfactual_key=counterfactual_key,
-            swapped_key=swapped_key,
-            relabeled_key=relabeled_key,
-            trajectory_key=trajectory_key,
-            done_key=done_key,
+            keys=keys,
             check=check,
         )
         if len(layout) > MAX_ENTITIES:
             raise ValueError(
                 f"the layout has {len(layout)} entities, but components are bit masks "
-                f"of at most {MAX_ENTITIES}: lay entities together that never part"
+                f"of at most {MAX_ENTITIES}: join entities that always move together"
             )
         self._fixed = layout.fixed_mask
 

@@ -1,7 +1,7 @@
 """Connected components of local graphs, and drawing donors for them (CoDA).
 
 A component is an int64 bit mask, the bit ``i`` set for the entity ``i``, so at most 64
-entities. Notation as in :mod:`torchrl_caiac.transforms.donors`.
+entities. Notation as in :mod:`torchrl_caiac.transforms.draws`.
 """
 
 from __future__ import annotations
@@ -11,17 +11,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 
-from torchrl_caiac._random import draw_numbers
-from torchrl_caiac.transforms.donors import (
-    _CHUNK,
-    _RANDOM_BITS,
-    BufferDonors,
-    SwapDraw,
-    TrajectoryIndex,
-    _pick,
-    _scan,
-    _window_max,
-)
+from torchrl_caiac._random import draw_integers, draw_numbers
+from torchrl_caiac.trajectories import TrajectoryIndex
+from torchrl_caiac.transforms.donors import BufferDonors, scan_donors
+from torchrl_caiac.transforms.draws import SwapDraw
+from torchrl_caiac.transforms.indexing import pick_rows, window_max
 
 __all__ = [
     "MAX_ENTITIES",
@@ -35,7 +29,8 @@ __all__ = [
 
 MAX_ENTITIES = 64
 
-# Elements of graphs that are looked at together while an index is built.
+# Rows, and elements of graphs, that are read together while an index is built.
+_CHUNK_ROWS = 1 << 20
 _CHUNK_ELEMENTS = 1 << 24
 
 
@@ -144,7 +139,7 @@ def components(
         >>> components(graph, 0.2)
         tensor([[0, 6, 6, 8]])
     """
-    links, held = _links(_window_max(graphs, window), threshold)
+    links, held = _links(window_max(graphs, window), threshold)
     if fixed is not None:
         held = held | _packed(fixed.to(held.device))
     return _joined(links, held)
@@ -164,9 +159,7 @@ def _shared(
             torch.rand, masks.shape, device=device, generator=generator
         )
         wanted = wanted & (chance < swap_prob).gather(1, leader)
-    pick = draw_numbers(
-        torch.randint, _RANDOM_BITS, masks.shape, device=device, generator=generator
-    )
+    pick = draw_integers(masks.shape, device=device, generator=generator)
     return leader, pick.gather(1, leader), wanted
 
 
@@ -218,7 +211,7 @@ def draw_batch_components(
     chosen = begin + pick % others.clamp_min(1)
     # A window is among those of its own component: step over it.
     chosen += chosen >= place.view(windows, entities)[first:].gather(1, leader)
-    donors = _pick(order, chosen.clamp_max(order.shape[0] - 1)) // entities
+    donors = pick_rows(order, chosen.clamp_max(order.shape[0] - 1)) // entities
     swapped = wanted & (others > 0)
     return SwapDraw(donors * window, swapped, (wanted ^ swapped).sum(0))
 
@@ -259,10 +252,10 @@ def draw_buffer_components(
     _, pick, wanted = _shared(masks, swap_prob, generator)
     place = torch.searchsorted(index.masks, masks.to(home))
     place = place.clamp_max(index.masks.shape[0] - 1)
-    found = (_pick(index.masks, place) == masks.to(home)).to(device)
-    size, offset = _pick(index.size, place), _pick(index.offset, place)
+    found = (pick_rows(index.masks, place) == masks.to(home)).to(device)
+    size, offset = pick_rows(index.size, place), pick_rows(index.offset, place)
     chosen = pick.to(home) % size.clamp_min(1) + offset
-    donors = _pick(index.starts, chosen).to(device, torch.int64)
+    donors = pick_rows(index.starts, chosen).to(device, torch.int64)
     swapped = wanted & found
     return SwapDraw(donors, swapped, (wanted ^ swapped).sum(0))
 
@@ -322,10 +315,10 @@ def component_starts(
     device = graphs.device
     dtype = torch.int32 if length < 1 << 31 else torch.int64
     never = _packed(fixed.to(device))
-    step = min(_CHUNK, max(window, _CHUNK_ELEMENTS // (entities * (entities + 1))))
+    step = min(_CHUNK_ROWS, max(window, _CHUNK_ELEMENTS // (entities * (entities + 1))))
     masks = [torch.empty(0, dtype=torch.int64, device=device)]
     starts = [torch.empty(0, dtype=dtype, device=device)]
-    for rows, part in _scan(graphs, step, window, trajectories, "graphs"):
+    for rows, part in scan_donors(graphs, step, window, trajectories, "graphs"):
         links, held = _links(part, threshold)
         joined = _joined(_slid(links, window), _slid(held, window) | never)
         rows = rows[: joined.shape[0]]
@@ -349,17 +342,18 @@ class ComponentDonors(BufferDonors):
     ``score_key`` and bit masks in the place of free entities.
     """
 
-    _what: ClassVar[str] = "graphs"
-    _key_argument: ClassVar[str] = "graph_key"
+    scores_name: ClassVar[str] = "graphs"
+    key_argument: ClassVar[str] = "graph_key"
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
         """The shape of one row's graph, ``(N + 1, N)``."""
         return len(self.layout) + 1, len(self.layout)
 
-    def _eligible(
+    def eligible(
         self, scores: torch.Tensor, trajectories: TrajectoryIndex | None
     ) -> ComponentIndex:
+        """Finds the windows that may donate, see :func:`component_starts`."""
         return component_starts(
             scores,
             self.threshold,
@@ -368,7 +362,8 @@ class ComponentDonors(BufferDonors):
             trajectories=trajectories,
         )
 
-    def _choose(self, free: torch.Tensor, index: Any, **kwargs: Any) -> SwapDraw:
+    def choose(self, free: torch.Tensor, index: Any, **kwargs: Any) -> SwapDraw:
+        """Draws among the windows of :meth:`eligible`."""
         return draw_buffer_components(free, index, **kwargs)
 
     def draw(

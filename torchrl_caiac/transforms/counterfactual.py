@@ -1,30 +1,34 @@
-"""What augmentations share: batches, donors, goals, marks and checks."""
+"""What augmentations share: from scores to counterfactual transitions."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 from torchrl.envs.transforms import Transform
 
-from torchrl_caiac.entities import EntityLayout, _path
-from torchrl_caiac.transforms.donors import (
-    BufferDonors,
-    RewardFn,
-    SwapDraw,
-    _number,
-    apply_swap,
-    recompute_reward,
+from torchrl_caiac._keys import as_key
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms.checks import (
+    BatchCheck,
+    check_generator,
+    check_layout,
+    check_number,
+    check_reward_fn,
+    check_window,
 )
-from torchrl_caiac.transforms.hindsight_goal import take_back
-from torchrl_caiac.transforms.late_check import LateCheck
-from torchrl_caiac.transforms.window_goal import WindowGoal
+from torchrl_caiac.transforms.donors import BufferDonors
+from torchrl_caiac.transforms.draws import SwapDraw
+from torchrl_caiac.transforms.goals.window import WindowGoal
+from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.rewards import RewardFn, recompute_reward
+from torchrl_caiac.transforms.swap import SwapPlan, SwapPlanner, apply_swap
 
 __all__ = ["CounterfactualTransform"]
 
@@ -32,111 +36,68 @@ _Transform = TypeVar("_Transform", bound="CounterfactualTransform")
 
 
 class CounterfactualTransform(Transform, ABC):
-    """Makes the last rows of a batch counterfactual, by scores that the rows carry.
+    """Makes the last rows of a batch counterfactual, by the scores that they carry.
 
     A subclass says what may be swapped (:meth:`swappable`) and with whom
-    (:attr:`draw_in_batch`; in :attr:`donors_class` for a donor buffer). Everything
-    else is here: see :class:`~torchrl_caiac.transforms.CAIACTransform` for what a
-    batch gains and for the arguments.
+    (:attr:`draw_in_batch`; :attr:`donors_class` for a donor buffer). Each sample takes
+    the same steps: scores, draw, swap, rewards, check. See
+    :class:`~torchrl_caiac.transforms.CAIACTransform` for what a batch gains.
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
-
-    Keyword Args:
         threshold (float): the largest score of what is no influence, θ.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual.
+
+    Keyword Args:
         swap_prob (float): probability of swapping what may be swapped.
-        window (int): rows a window, κ.
+        window (int): rows in a window, κ.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn.
         score_key (NestedKey): the scores.
         reward_fn (callable, optional): recomputes rewards of counterfactual rows.
-        reward_key (NestedKey): the rewards.
         goals (WindowGoal, optional): draws the goals of donor windows.
         generator (torch.Generator, optional): source of randomness.
-        counterfactual_key (NestedKey): the mark of counterfactual rows.
-        swapped_key (NestedKey): the mark of swapped entities.
-        relabeled_key (NestedKey): the mark of a relabelling done before.
-        trajectory_key (NestedKey): trajectory ids.
-        done_key (NestedKey): end flags, read where there are no ids.
+        keys (TransformKeys, optional): the other keys.
         check (bool): check the values of each batch.
     """
 
-    #: Draws among the windows of the batch, from what :meth:`swappable` gave.
+    #: Draws among the windows of the batch, from what :meth:`swappable` returned.
     draw_in_batch: ClassVar[Callable[..., SwapDraw]]
     donors_class: ClassVar[type[BufferDonors]] = BufferDonors
-    _what: ClassVar[str] = "scores"
-    _key_argument: ClassVar[str] = "score_key"
     _wanted: ClassVar[str] = "one score for each of"
 
     def __init__(
         self,
         layout: EntityLayout,
-        *,
         threshold: float,
         counterfactual_ratio: float,
+        *,
         swap_prob: float,
         window: int,
         donors: ReplayBuffer | TensorStorage | None,
         score_key: NestedKey,
         reward_fn: RewardFn | None,
-        reward_key: NestedKey,
         goals: WindowGoal | None,
         generator: torch.Generator | None,
-        counterfactual_key: NestedKey,
-        swapped_key: NestedKey,
-        relabeled_key: NestedKey,
-        trajectory_key: NestedKey,
-        done_key: NestedKey,
+        keys: TransformKeys | None,
         check: bool,
     ) -> None:
         super().__init__()
-        if not isinstance(layout, EntityLayout):
-            raise TypeError(f"layout is an EntityLayout, got {type(layout).__name__}")
-        self.layout = layout
-        self.threshold = _number("threshold", threshold, math.inf)
-        self.counterfactual_ratio = _number(
+        self.layout = check_layout(layout)
+        self.threshold = check_number("threshold", threshold, math.inf)
+        self.counterfactual_ratio = check_number(
             "counterfactual_ratio", counterfactual_ratio, 1.0
         )
-        self.swap_prob = _number("swap_prob", swap_prob, 1.0)
-        if isinstance(window, bool) or not isinstance(window, int):
-            raise TypeError(f"window is a number of rows, an int; got {window!r}")
-        if window < 1:
-            raise ValueError(f"window is at least 1 row, got {window}")
-        if reward_fn is not None and not callable(reward_fn):
-            raise TypeError(
-                "reward_fn is a function of the next achieved and the desired goals, "
-                f"got {type(reward_fn).__name__}"
-            )
-        if generator is not None and not isinstance(generator, torch.Generator):
-            raise TypeError(
-                f"generator is a torch.Generator, got {type(generator).__name__}"
-            )
-        if goals is not None:
-            if not isinstance(goals, WindowGoal):
-                raise TypeError(f"goals is a WindowGoal, got {type(goals).__name__}")
-            if donors is None:
-                raise ValueError(
-                    "goals draws the goals of donor windows of a donor buffer, and "
-                    "there is none: donors in the batch bring their goals with them"
-                )
-            if goals.window != window or goals.layout != layout:
-                raise ValueError(
-                    f"goals has window {goals.window} and its own layout, the "
-                    f"transform has window {window}: both must be the same"
-                )
-        self.window = window
-        self.score_key = unravel_key(score_key)
-        self.reward_fn = reward_fn
-        self.reward_key = unravel_key(reward_key)
-        self.generator = generator
-        self.counterfactual_key = unravel_key(counterfactual_key)
-        self.swapped_key = unravel_key(swapped_key)
-        self.relabeled_key = unravel_key(relabeled_key)
-        self.trajectory_key = unravel_key(trajectory_key)
-        self.done_key = unravel_key(done_key)
+        self.swap_prob = check_number("swap_prob", swap_prob, 1.0)
+        self.window = check_window(window)
+        self.score_key = as_key(score_key)
+        self.reward_fn = None if reward_fn is None else check_reward_fn(reward_fn)
+        self.generator = check_generator(generator)
+        self.keys = keys or TransformKeys()
         self.check = bool(check)
-        # In a tuple, so that torch does not take goals for a submodule.
+        if goals is not None:
+            self._check_goals(goals, donors)
+        # In a tuple, so that torch does not register the goals as a submodule.
         self._donors: tuple[BufferDonors, ...] = ()
         if donors is not None:
             self._donors = (
@@ -146,13 +107,44 @@ class CounterfactualTransform(Transform, ABC):
                     threshold=self.threshold,
                     window=window,
                     score_key=self.score_key,
-                    trajectory_key=self.trajectory_key,
-                    done_key=self.done_key,
+                    keys=self.keys,
                     goals=goals,
                 ),
             )
+        self._planner = SwapPlanner(layout)
+        self._batch_check = BatchCheck(
+            layout,
+            score_key=self.score_key,
+            window=window,
+            keys=self.keys,
+            scores_name=self.donors_class.scores_name,
+        )
         self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
-        self._late = LateCheck()
+        swapped = self._planner.keys
+        rewards = [] if reward_fn is None else [self.keys.reward]
+        self.in_keys = [*swapped, self.score_key, *rewards]
+        self.out_keys = [
+            *swapped,
+            *rewards,
+            self.keys.counterfactual,
+            self.keys.swapped,
+        ]
+
+    def _check_goals(
+        self, goals: Any, donors: ReplayBuffer | TensorStorage | None
+    ) -> None:
+        if not isinstance(goals, WindowGoal):
+            raise TypeError(f"goals is a WindowGoal, got {type(goals).__name__}")
+        if donors is None:
+            raise ValueError(
+                "goals draws the goals of donor windows of a donor buffer, and there "
+                "is none: donors in the batch bring their goals with them"
+            )
+        if goals.window != self.window or goals.layout != self.layout:
+            raise ValueError(
+                f"goals has window {goals.window} and its own layout, the transform "
+                f"has window {self.window}: both must be the same"
+            )
 
     # --- what augmentations differ in ------------------------------------------------
 
@@ -163,7 +155,7 @@ class CounterfactualTransform(Transform, ABC):
 
     @abstractmethod
     def swappable(self, scores: torch.Tensor) -> torch.Tensor:
-        """What may be swapped in each window.
+        """Returns what may be swapped in each window.
 
         Args:
             scores (torch.Tensor): ``[B * window, *feature_shape]``.
@@ -183,7 +175,7 @@ class CounterfactualTransform(Transform, ABC):
     def no_donor_count(self) -> torch.Tensor:
         """How often each entity should have been swapped and had no donor.
 
-        int64 ``[N]``, in windows, since the transform was made or
+        int64 ``[N]``, in windows, since the transform was created or
         :meth:`reset_no_donor_count` was called.
         """
         return self._no_donor.clone()
@@ -201,10 +193,10 @@ class CounterfactualTransform(Transform, ABC):
         self.generator = generator
 
     def refresh_donors(self) -> None:
-        """Has the index of eligible donors built anew.
+        """Drops the index of eligible donors, so that it is built again.
 
         It is rebuilt after every write through the buffer or its storage; call this
-        after writing into the storage's raw tensors.
+        after writing to the storage's raw tensors.
         """
         for donors in self._donors:
             donors.refresh()
@@ -217,7 +209,7 @@ class CounterfactualTransform(Transform, ABC):
     # --- the two halves of an augmentation -------------------------------------------
 
     def num_counterfactual(self, windows: int) -> int:
-        """How many of the last windows of a batch become counterfactual.
+        """Returns how many of the last windows of a batch become counterfactual.
 
         Args:
             windows (int): windows in the batch, ``B``.
@@ -234,8 +226,8 @@ class CounterfactualTransform(Transform, ABC):
 
         Args:
             scores (torch.Tensor): the batch's, ``[B * window, *feature_shape]``.
-            generator (torch.Generator, optional): source of randomness; the
-                transform's own by default.
+            generator (torch.Generator, optional): source of randomness. Defaults to
+                the transform's own.
 
         Returns:
             SwapDraw: the draw, for the last ``C`` windows.
@@ -267,27 +259,35 @@ class CounterfactualTransform(Transform, ABC):
             draw (SwapDraw): from :meth:`generate_parameters`.
 
         Returns:
-            TensorDictBase: the batch with counterfactual rows, and marked.
+            TensorDictBase: the batch with counterfactual rows and their flags.
         """
+        return self._apply(tensordict, *self._planner(tensordict), draw)
+
+    def _apply(
+        self,
+        td: TensorDictBase,
+        plan: SwapPlan,
+        values: Sequence[torch.Tensor],
+        draw: SwapDraw,
+    ) -> TensorDictBase:
         if self._donors:
-            out = self._donors[0].apply(tensordict, draw)
+            out = self._donors[0].apply(td, plan, values, draw)
         else:
-            out = apply_swap(tensordict, self.layout, draw, window=self.window)
-        windows = draw.swapped.shape[0]
-        changed, total = windows * self.window, tensordict.shape[0]
+            out = apply_swap(td, plan, values, draw, window=self.window)
+        keys, swapped = self.keys, draw.swapped
+        total, changed = td.shape[0], swapped.shape[0] * self.window
         if self.reward_fn is not None and changed:
             reward = recompute_reward(
-                out, self.layout, self.reward_fn, changed, reward_key=self.reward_key
+                out, self.layout, self.reward_fn, changed, reward_key=keys.reward
             )
-            out.set(self.reward_key, reward)
-        swapped = draw.swapped
+            out.set(keys.reward, reward)
         if self.window > 1:
             swapped = swapped.unsqueeze(1).expand(-1, self.window, -1).flatten(0, 1)
         kept = swapped.new_zeros(total - changed, swapped.shape[-1])
         counterfactual = swapped.new_zeros(total, 1)
         counterfactual[total - changed :].fill_(True)
-        out.set(self.counterfactual_key, counterfactual)
-        out.set(self.swapped_key, torch.cat([kept, swapped]))
+        out.set(keys.counterfactual, counterfactual)
+        out.set(keys.swapped, torch.cat([kept, swapped]))
         return out
 
     # --- the transform ---------------------------------------------------------------
@@ -303,37 +303,34 @@ class CounterfactualTransform(Transform, ABC):
 
         Raises:
             KeyError: scores, or a leaf that the layout names, are missing.
+            RuntimeError: the batch was relabelled before.
             ValueError: the batch does not fit the layout or the window, or a value is
                 not finite.
         """
-        tensordict, relabel = take_back(tensordict, self.relabeled_key)
         scores = self._scores(tensordict)
+        plan, values = self._planner(tensordict)
         draw = self.generate_parameters(scores)
-        out = self.apply_parameters(tensordict, draw)
+        out = self._apply(tensordict, plan, values, draw)
         if self.check:
-            self._check(tensordict, out, scores)
+            self._batch_check(tensordict, out, scores, plan.states)
         if self._no_donor.device != draw.no_donor.device:
             self._no_donor = self._no_donor.to(draw.no_donor.device)
         self._no_donor += draw.no_donor
-        return out if relabel is None else relabel(out)
+        return out
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # A row without a score of its own would keep that of the row it replaces.
-        if tensordict.get(self.score_key, None) is None:
-            nan = torch.full(
-                (*tensordict.batch_size, *self.feature_shape),
-                math.nan,
-                device=tensordict.device,
-            )
-            tensordict.set(self.score_key, nan)
-        return tensordict
+        # A score is good for one place in one trajectory: an incoming one must not
+        # pass for the new row's, nor must that of the row that is replaced.
+        shape = (*tensordict.batch_size, *self.feature_shape)
+        unscored = torch.full(shape, math.nan, device=tensordict.device)
+        return tensordict.set(self.score_key, unscored)
 
     def _scores(self, td: TensorDictBase) -> torch.Tensor:
         if td.ndim != 1 or not td.shape[0]:
             raise ValueError(
-                f"the batch has shape {list(td.shape)}, wanted [B * window] with rows "
-                "in it: sample flat batches from a buffer that holds data (use "
-                "rb.storage[...] to read rows as they are stored)"
+                f"the batch has shape {list(td.shape)}, expected [B * window] with at "
+                "least one row: sample flat batches from a buffer that is not empty "
+                "(use rb.storage[...] to read rows as they are stored)"
             )
         if td.shape[0] % self.window:
             raise ValueError(
@@ -341,125 +338,31 @@ class CounterfactualTransform(Transform, ABC):
                 f"not divide: sample slices of this length, e.g. SliceSampler("
                 f"slice_len={self.window}), and a batch size that is a multiple of it"
             )
+        if td.get(self.keys.relabeled, None) is not None:
+            raise RuntimeError(
+                f"HindsightGoal relabelled this batch before {type(self).__name__}, so "
+                "that its goals would be swapped as if they were stored: append "
+                f"{type(self).__name__} first, HindsightGoal after it"
+            )
         scores = td.get(self.score_key, None)
         if scores is None:
+            donors = self.donors_class
             raise KeyError(
-                f"the batch has no {self._what} in {self.score_key!r}: call "
+                f"the batch has no {donors.scores_name} in {self.score_key!r}: call "
                 "score_buffer on the replay buffer, or name their key by "
-                f"{self._key_argument}"
+                f"{donors.key_argument}"
             )
-        wanted = (td.shape[0], *self.feature_shape)
-        if tuple(scores.shape) != wanted:
+        expected = (td.shape[0], *self.feature_shape)
+        if tuple(scores.shape) != expected:
             raise ValueError(
-                f"{self.score_key!r} has shape {list(scores.shape)}, wanted "
-                f"{list(wanted)}: {self._wanted} the entities "
+                f"{self.score_key!r} has shape {list(scores.shape)}, expected "
+                f"{list(expected)}: {self._wanted} the entities "
                 f"{list(self.layout.names)}"
             )
         return scores
 
-    # --- checking --------------------------------------------------------------------
-
-    def _observed(self, td: TensorDictBase) -> list[tuple[Any, torch.Tensor]]:
-        found = []
-        for key in self.layout.in_keys:
-            for where in (key, self.layout.next(key)):
-                value = td.get(where)
-                if isinstance(value, torch.Tensor):
-                    found.append((where, value))
-                else:
-                    found += [
-                        ((where, *_path(below)), leaf)
-                        for below, leaf in value.items(True, True)
-                    ]
-        return [(where, leaf) for where, leaf in found if leaf.is_floating_point()]
-
-    def _check(
-        self, before: TensorDictBase, after: TensorDictBase, scores: torch.Tensor
-    ) -> None:
-        """Raises where values make no sense: on CUDA devices, with a later batch."""
-        observed = self._observed(after)
-        neighbours = self._neighbours(before)
-        leaves = [scores, *(leaf for _, leaf in observed)]
-        # A sum is finite if all its terms are (unless it overflows: looked at below).
-        if not LateCheck.needed(scores.device):
-            finite = math.isfinite(sum(leaf.sum().item() for leaf in leaves))
-            if not finite or not (neighbours is None or torch.equal(*neighbours)):
-                self._explain(after, scores, neighbours)
-            return
-        found = self._late.found()
-        if found:
-            self._explain(after, scores, neighbours)  # it is likely wrong here too
-            names = [self.score_key, *(key for key, _ in observed), "the windows"]
-            raise ValueError(
-                f"{[names[place] for place in found]} made no sense in a batch that "
-                f"was sampled before this one: {self._what} or observations are NaN or "
-                "infinite, or windows cross a trajectory's end. On a CUDA device "
-                "errors come late; sample the same data on the CPU to learn the rows"
-            )
-        sums = [leaf.sum(dtype=torch.float64) for leaf in leaves]
-        if neighbours is not None:
-            crosses = (neighbours[0] != neighbours[1]).any()
-            sums.append(torch.where(crosses, math.nan, 0.0).double())
-        self._late.add(torch.stack(sums))
-
-    def _neighbours(
-        self, td: TensorDictBase
-    ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Two ``[B, window - 1]`` that are equal where windows stay in a trajectory."""
-        if self.window == 1:
-            return None
-        ids = td.get(self.trajectory_key, None)
-        if ids is not None:
-            ids = ids.reshape(-1, self.window)
-            return ids[:, 1:], ids[:, :-1]
-        done = td.get(self.done_key, None)
-        if done is None:
-            return None
-        done = done.reshape(-1, self.window)[:, :-1].bool()
-        return done, torch.zeros_like(done)
-
-    def _explain(
-        self,
-        after: TensorDictBase,
-        scores: torch.Tensor,
-        neighbours: tuple[torch.Tensor, torch.Tensor] | None,
-    ) -> None:
-        names = self.layout.names
-        nan, infinite = scores.isnan(), scores.isinf()
-        if nan.any():
-            rows = int(nan.flatten(1).any(1).sum())
-            who = [names[i] for i in _columns(nan)]
-            raise ValueError(
-                f"{self.score_key!r} is NaN, that is not scored, in {rows} of "
-                f"{scores.shape[0]} rows for {who}: call score_buffer on the replay "
-                "buffer after extending it"
-            )
-        if infinite.any():
-            who = [names[i] for i in _columns(infinite)]
-            raise ValueError(
-                f"{self.score_key!r} is infinite for {who}: check the influence "
-                "measure, then call score_buffer(..., overwrite=True)"
-            )
-        if neighbours is not None and not torch.equal(*neighbours):
-            crosses = neighbours[0] != neighbours[1]
-            window = int(crosses.any(1).nonzero()[0, 0])
-            raise ValueError(
-                f"window {window} of {self.window} rows crosses a trajectory's end: "
-                f"use SliceSampler with slice_len={self.window} and "
-                "strict_length=True, and trajectories of at least this length"
-            )
-        for key, leaf in self._observed(after):
-            bad = ~leaf.isfinite()
-            if bad.any():
-                row = int(bad.flatten(1).any(1).nonzero()[0, 0])
-                raise ValueError(
-                    f"{key!r} is not finite (NaN or infinite) in {int(bad.sum())} "
-                    f"values, first in row {row} of the batch: clean the data, or "
-                    "the donors' data"
-                )
-
     def extra_repr(self) -> str:
-        """The arguments, for ``repr``."""
+        """Returns the arguments, for ``repr``."""
         donors = f"{type(self.donors).__name__}" if self._donors else "the batch"
         return (
             f"threshold={self.threshold}, "
@@ -469,8 +372,3 @@ class CounterfactualTransform(Transform, ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.extra_repr()})"
-
-
-def _columns(bad: torch.Tensor) -> list[int]:
-    """The entities that have a bad score, ``[*, N]``."""
-    return bad.reshape(-1, bad.shape[-1]).any(0).nonzero()[:, 0].tolist()

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 
 from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.transforms.donors import (
-    RewardFn,
-    _number,
-    _pick,
-    _storage_td,
-    call_reward,
-    stored_reward,
-)
-from torchrl_caiac.transforms.future_goal import FutureGoal, draw_goal_offset
+from torchrl_caiac.transforms.checks import check_number, check_reward_fn
+from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
+from torchrl_caiac.transforms.indexing import pick_rows
+from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.rewards import RewardFn, call_reward, stored_reward
 
-__all__ = ["HindsightDraw", "HindsightGoal", "take_back"]
+__all__ = ["HindsightDraw", "HindsightGoal"]
 
 Goals = dict[NestedKey, torch.Tensor]
 
@@ -44,68 +39,61 @@ class HindsightDraw(NamedTuple):
 class HindsightGoal(FutureGoal):
     """Relabels the goals of transitions, real and counterfactual ones (A.5.2).
 
-    Rows that are not marked as counterfactual get, with probability ``future``, a goal
-    that was achieved later in their own trajectory and, with probability ``random``,
-    the goal that a random real row of the batch achieves. Rows that are marked get,
-    with probability ``counterfactual``, the goal that a random counterfactual row of
-    the batch achieves after swapping. All other rows keep their desired goals.
-    "Achieves" means the next state: goals are read as by
-    :class:`~torchrl_caiac.transforms.WindowGoal`, so that a row whose goal is its own
-    next achieved goal is a success.
+    Real transitions get, with probability ``future``, a goal that was achieved later
+    in their own trajectory and, with probability ``random``, the goal that a random
+    real transition of the batch achieves. Counterfactual transitions get, with
+    probability ``counterfactual``, the goal that a random counterfactual transition of
+    the batch achieves after swapping. All others keep their desired goals. "Achieves"
+    means the next state: goals are read as by
+    :class:`~torchrl_caiac.transforms.WindowGoal`, so that a transition whose goal is
+    its own next achieved goal is a success.
 
-    Rewards of relabelled rows are made anew by ``reward_fn`` from the row's *next*
-    achieved goal, and so are those of counterfactual rows, so that
+    The rewards of relabelled and of counterfactual transitions are recomputed by
+    ``reward_fn`` from the *next* achieved goal, so
     :class:`~torchrl_caiac.CAIACTransform` needs no ``reward_fn`` of its own. End flags
     stay as they were stored: this is meant for tasks that do not end at their goal.
 
-    Append it behind the augmentation. Before it, it works too: the augmentation takes
-    the relabelling back, swaps the stored goals, and has it done again.
+    Append it after the augmentation. Before it, the augmentation raises.
 
-    Where ``future`` is not 0, the same object is the buffer's ``sample_unit``, in
-    which it sees the sampled rows and draws goals from the storage. Where it is 0 the
-    batch is enough, and a :class:`~torchrl.data.HERReplayBuffer` can do the relabelling
-    of real rows, see :meth:`her_reward`.
+    Where ``future`` is not 0, pass the same object to the buffer as ``sample_unit``: it
+    sees the sampled rows there, and draws goals from the storage. Where it is 0 the
+    batch is enough, and a :class:`~torchrl.data.HERReplayBuffer` can relabel the real
+    transitions, see :meth:`her_reward`.
 
-    The paper's arms, with half of each batch counterfactual:
+    The paper's methods, with half of each batch counterfactual:
 
     ==================  ==========================================================
     ``caiac``           ``CAIACTransform(layout)``, ``HindsightGoal(layout, r)``
     ``relabel_only``    ``CAIACTransform(layout, swap_prob=0.0)``,
-                        ``HindsightGoal(layout, r)``: the same rows are relabelled
-                        as counterfactuals, nothing is swapped
+                        ``HindsightGoal(layout, r)``: the same transitions are
+                        relabelled as counterfactuals, nothing is swapped
     ``none``            ``HindsightGoal(layout, r, random=0.25)`` alone: the share of
-                        random goals that the other arms have
+                        random goals that the other methods have
     ==================  ==========================================================
 
     Args:
         layout (EntityLayout): the entities and their goals.
         reward_fn (callable): ``(next_achieved [B, G], desired [B, G])`` to rewards
-            ``[B]`` or ``[B, 1]``. A nested layout's goals are laid side by side,
-            flattened, in layout order.
+            ``[B]`` or ``[B, 1]``. A nested layout's goals are concatenated, flattened,
+            in layout order.
 
     Keyword Args:
-        future (float): share of real rows with a goal of their future. Defaults to
-            0.5.
-        random (float): share of real rows with a goal of another row; ``future`` and
-            it are at most 1 together. Defaults to 0.
-        counterfactual (float): share of counterfactual rows with a goal of
-            counterfactual rows. Defaults to 0.5.
+        future (float): share of real transitions with a goal of their future. Defaults
+            to 0.5.
+        random (float): share of real transitions with a goal of another one;
+            ``future`` and ``random`` are at most 1 together. Defaults to 0.
+        counterfactual (float): share of counterfactual transitions with a goal of
+            counterfactual ones. Defaults to 0.5.
         strategy (str): how future goals are drawn. ``"geometric"``: the state
-            ``k >= 1`` steps after the row's own with probability
+            ``k >= 1`` steps after the transition's own with probability
             ``p * (1 - p) ** (k - 1)``, or the trajectory's last one; ``"uniform"``: any
             later state. Defaults to ``"geometric"``.
         p (float): the parameter of ``"geometric"``. Defaults to 0.2.
-        trajectory_key (NestedKey): trajectory ids in the storage. Defaults to
-            ``"episode"``; without such a leaf, trajectories end at ``done_key``.
-        done_key (NestedKey): end flags. Defaults to ``("next", "done")``.
-        reward_key (NestedKey): the rewards, ``[B]`` or ``[B, 1]``. Defaults to
-            ``("next", "reward")``.
-        counterfactual_key (NestedKey): the augmentation's mark, bool ``[B, 1]``.
-            Defaults to ``("caiac", "counterfactual")``.
-        relabeled_key (NestedKey): where to write which rows got another goal, bool
-            ``[B, 1]``. Defaults to ``("hindsight", "relabeled")``.
-        generator (torch.Generator, optional): source of randomness; torch's default
-            generator without it. The same state gives the same batch.
+        generator (torch.Generator, optional): source of randomness. Defaults to
+            torch's default generator. The same state gives the same batch.
+        keys (TransformKeys, optional): rewards, trajectory ids, end flags, the flag of
+            counterfactuals that is read and the flag ``relabeled``, bool ``[B, 1]``,
+            that is written. Defaults to ``TransformKeys()``.
 
     Raises:
         TypeError: an argument has the wrong type.
@@ -150,40 +138,29 @@ class HindsightGoal(FutureGoal):
         counterfactual: float = 0.5,
         strategy: Literal["geometric", "uniform"] = "geometric",
         p: float = 0.2,
-        trajectory_key: NestedKey = "episode",
-        done_key: NestedKey = ("next", "done"),
-        reward_key: NestedKey = ("next", "reward"),
-        counterfactual_key: NestedKey = ("caiac", "counterfactual"),
-        relabeled_key: NestedKey = ("hindsight", "relabeled"),
         generator: torch.Generator | None = None,
+        keys: TransformKeys | None = None,
     ) -> None:
-        super().__init__(
-            layout,
-            p=p,
-            trajectory_key=trajectory_key,
-            done_key=done_key,
-            counterfactual_key=counterfactual_key,
-            generator=generator,
-        )
-        if not callable(reward_fn):
-            raise TypeError(
-                "reward_fn is a function of the next achieved and the desired goals, "
-                f"got {type(reward_fn).__name__}"
-            )
+        super().__init__(layout, p=p, generator=generator, keys=keys)
         if strategy not in ("geometric", "uniform"):
             raise ValueError(f"strategy is 'geometric' or 'uniform', got {strategy!r}")
-        self.reward_fn = reward_fn
-        self.future = _number("future", future, 1.0)
-        self.random = _number("random", random, 1.0)
-        self.counterfactual = _number("counterfactual", counterfactual, 1.0)
+        self.reward_fn = check_reward_fn(reward_fn)
+        self.future = check_number("future", future, 1.0)
+        self.random = check_number("random", random, 1.0)
+        self.counterfactual = check_number("counterfactual", counterfactual, 1.0)
         if self.future + self.random > 1.0:
             raise ValueError(
                 "future and random are shares of the real rows, at most 1 together; "
                 f"got {future!r} and {random!r}"
             )
         self.strategy = strategy
-        self.reward_key = unravel_key(reward_key)
-        self.relabeled_key = unravel_key(relabeled_key)
+        self.in_keys = [
+            *self.achieved_keys,
+            *self.goal_keys,
+            self.keys.reward,
+            self.keys.counterfactual,
+        ]
+        self.out_keys = [*self.goal_keys, self.keys.reward, self.keys.relabeled]
 
     # --- drawing ---------------------------------------------------------------------
 
@@ -204,10 +181,9 @@ class HindsightGoal(FutureGoal):
             tuple: ``index`` and ``info``.
         """
         if self.future > 0:
-            data = _storage_td(storage, "the buffer")
-            trajectories = self._cache.get(storage)
+            data, trajectories = self.stored(storage)
             rows = index[0] if isinstance(index, tuple) else index
-            rows = rows.reshape(-1).to(trajectories.ends.device)
+            rows = rows.reshape(-1).to(trajectories.device)
             offset = draw_goal_offset(
                 trajectories.remaining(rows),
                 {self.strategy: 1.0},
@@ -215,7 +191,7 @@ class HindsightGoal(FutureGoal):
                 generator=self.generator,
             )
             self._pending.goals = self.read_goals(
-                data, (rows + offset) % trajectories.length
+                data, trajectories.later(rows, offset)
             )
         return index, info
 
@@ -228,7 +204,7 @@ class HindsightGoal(FutureGoal):
         """Draws which rows are relabelled, and from where.
 
         Args:
-            counterfactual (torch.Tensor): bool ``[B, 1]``, the augmentation's mark.
+            counterfactual (torch.Tensor): bool ``[B, 1]``, the augmentation's flag.
             future (mapping, optional): future goals ``[B, ...]`` by desired-goal leaf;
                 needed where :attr:`future` is not 0.
             generator (torch.Generator, optional): source of randomness; the
@@ -243,22 +219,22 @@ class HindsightGoal(FutureGoal):
                 "rows, and none are given"
             )
         generator = self.generator if generator is None else generator
-        marks = counterfactual.reshape(-1)
-        rows, device = marks.shape[0], marks.device
+        flags = counterfactual.reshape(-1)
+        rows, device = flags.shape[0], flags.device
         chance, pick = draw_numbers(
             torch.rand, (2, rows), device=device, generator=generator
         ).double()
         own = torch.arange(rows, device=device)
         # Real rows first: each kind draws among the places that it takes up.
-        order = torch.argsort(marks.byte(), stable=True)
-        marked = marks.sum()
+        order = torch.argsort(flags.byte(), stable=True)
+        marked = flags.sum()
         real = rows - marked
-        place = (pick * torch.where(marks, marked, real)).long() + marks * real
-        goal = _pick(order, place) + rows
+        place = (pick * torch.where(flags, marked, real)).long() + flags * real
+        goal = pick_rows(order, place) + rows
         if self.future > 0:
-            goal = torch.where(marks | (chance >= self.future), goal, own + 2 * rows)
+            goal = torch.where(flags | (chance >= self.future), goal, own + 2 * rows)
         wanted = torch.where(
-            marks, chance < self.counterfactual, chance < self.future + self.random
+            flags, chance < self.counterfactual, chance < self.future + self.random
         )
         source = torch.where(wanted, goal, own)
         return HindsightDraw(source, future)
@@ -285,7 +261,7 @@ class HindsightGoal(FutureGoal):
     def _relabel(self, td: TensorDictBase, draw: HindsightDraw) -> Goals:
         """The leaves that a draw changes or adds."""
         relabeled = (draw.source >= td.shape[0]).unsqueeze(-1)
-        marks = td.get(self.counterfactual_key, None)
+        flags = td.get(self.keys.counterfactual, None)
         achieved = self.read_goals(td)
         goals: Goals = {}
         for key, reached in achieved.items():
@@ -294,15 +270,15 @@ class HindsightGoal(FutureGoal):
             if draw.future is not None:
                 parts.append(draw.future[key].to(desired))
             goals[key] = torch.cat(parts).index_select(0, draw.source)
-        old = stored_reward(td, self.reward_key)
+        old = stored_reward(td, self.keys.reward)
         reward = call_reward(self.reward_fn, _vector(achieved), _vector(goals), old)
-        anew = relabeled if marks is None else relabeled | marks
+        anew = relabeled if flags is None else relabeled | flags
         after = {self.layout.next(key): goal for key, goal in goals.items()}
         return {
             **goals,
             **{k: goal for k, goal in after.items() if td.get(k, None) is not None},
-            self.reward_key: torch.where(anew.view_as(old), reward, old),
-            self.relabeled_key: relabeled,
+            self.keys.reward: torch.where(anew.view_as(old), reward, old),
+            self.keys.relabeled: relabeled,
         }
 
     def apply_parameters(
@@ -316,13 +292,16 @@ class HindsightGoal(FutureGoal):
 
         Returns:
             TensorDictBase: a shallow copy with goals, also under ``next`` where the
-            batch has them there, rewards and the mark of relabelled rows.
+            batch has them there, rewards and the flag of relabelled ones.
 
         Raises:
             KeyError: goals or rewards are missing.
             ValueError: goals or rewards have the wrong shape.
         """
-        return _with(tensordict, self._relabel(tensordict, draw))
+        out = tensordict.copy()
+        for key, leaf in self._relabel(tensordict, draw).items():
+            out.set(key, leaf)
+        return out
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels a batch.
@@ -361,28 +340,22 @@ class HindsightGoal(FutureGoal):
                         f"batch has {rows}: append HindsightGoal before transforms "
                         "that change the batch size"
                     )
-        if tensordict.get(self.relabeled_key, None) is not None:
+        if tensordict.get(self.keys.relabeled, None) is not None:
             raise RuntimeError(
-                f"the batch is relabelled already, as {self.relabeled_key!r} says: "
+                f"the batch is already relabelled, as {self.keys.relabeled!r} says: "
                 "append one HindsightGoal only"
             )
-        marks = tensordict.get(self.counterfactual_key, None)
-        if marks is not None and marks.shape != (rows, 1):
+        flags = tensordict.get(self.keys.counterfactual, None)
+        if flags is not None and flags.shape != (rows, 1):
             raise ValueError(
-                f"{self.counterfactual_key!r} has shape {list(marks.shape)}, wanted "
+                f"{self.keys.counterfactual!r} has shape {list(flags.shape)}, wanted "
                 f"[{rows}, 1]"
             )
-        augmented = marks is not None
-        if marks is None:
-            device = stored_reward(tensordict, self.reward_key).device
-            marks = torch.zeros(rows, 1, dtype=torch.bool, device=device)
-        draw = self.generate_parameters(marks, goals)
-        leaves = self._relabel(tensordict, draw)
-        if not augmented:
-            # An augmentation may follow, which swaps goals as they were stored.
-            stored = {key: tensordict.get(key, None) for key in leaves}
-            _early.relabeling = _Early(self, goals, stored, leaves)
-        return _with(tensordict, leaves)
+        if flags is None:
+            device = stored_reward(tensordict, self.keys.reward).device
+            flags = torch.zeros(rows, 1, dtype=torch.bool, device=device)
+        draw = self.generate_parameters(flags, goals)
+        return self.apply_parameters(tensordict, draw)
 
     def her_reward(self, tensordict: TensorDictBase) -> torch.Tensor:
         """The reward function for a :class:`~torchrl.data.HERReplayBuffer`.
@@ -391,7 +364,7 @@ class HindsightGoal(FutureGoal):
         all transforms, from a uniformly drawn later row of the trajectory. With
         ``her_ratio`` at most ``1 - counterfactual_ratio`` these are real rows, and a
         ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones behind
-        them. The mark in :attr:`relabeled_key` is set for both. That buffer knows
+        them. The flag in :attr:`relabeled_key` is set for both. That buffer knows
         trajectories by their end flags only, and in TorchRL 0.14 it must not be
         written to once it is full.
 
@@ -421,8 +394,6 @@ class HindsightGoal(FutureGoal):
             ...     achieved_goal_key=("next", "achieved_goal"),
             ...     storage=LazyTensorStorage(20),
             ... )
-            >>> _ = rb.append_transform(CAIACTransform(layout))
-            >>> _ = rb.append_transform(goals)
             >>> state, end = torch.rand(20, 2), torch.zeros(20, 1, dtype=torch.bool)
             >>> _ = rb.extend(TensorDict({
             ...     "observation": state, "achieved_goal": state,
@@ -430,14 +401,16 @@ class HindsightGoal(FutureGoal):
             ...     "next": {"observation": state, "achieved_goal": state,
             ...         "reward": -torch.ones(20, 1), "done": end},
             ...     ("caiac", "score"): torch.zeros(20, 2)}, [20]))
+            >>> _ = rb.append_transform(CAIACTransform(layout))
+            >>> _ = rb.append_transform(goals)
             >>> rb.sample()["hindsight", "relabeled"][:4].flatten()
             tensor([ True,  True, False, False])
         """
-        marks = tensordict.get(self.counterfactual_key, None)
-        if marks is not None and marks.any():
+        flags = tensordict.get(self.keys.counterfactual, None)
+        if flags is not None and flags.any():
             raise ValueError(
                 f"HERReplayBuffer relabels the first {tensordict.shape[0]} rows of the "
-                f"batch, {int(marks.sum())} of which are counterfactual and have no "
+                f"batch, {int(flags.sum())} of which are counterfactual and have no "
                 "future of their own: give it a her_ratio of at most "
                 "1 - counterfactual_ratio"
             )
@@ -445,14 +418,14 @@ class HindsightGoal(FutureGoal):
         desired = {
             key: self._desired(tensordict, key, goal) for key, goal in achieved.items()
         }
-        relabeled = tensordict.get(self.relabeled_key, None)
+        relabeled = tensordict.get(self.keys.relabeled, None)
         if relabeled is not None:
-            relabeled.fill_(True)  # a view of the batch's mark, like all of these rows
+            relabeled.fill_(True)  # a view of the batch's flag, like all of these rows
         return call_reward(
             self.reward_fn,
             _vector(achieved),
             _vector(desired),
-            stored_reward(tensordict, self.reward_key),
+            stored_reward(tensordict, self.keys.reward),
         )
 
     def extra_repr(self) -> str:
@@ -464,70 +437,8 @@ class HindsightGoal(FutureGoal):
         )
 
 
-def _with(td: TensorDictBase, leaves: Goals) -> TensorDictBase:
-    out = td.copy()
-    for key, leaf in leaves.items():
-        out.set(key, leaf)
-    return out
-
-
 def _vector(goals: Goals) -> torch.Tensor:
     leaves = list(goals.values())
     if len(leaves) == 1 and leaves[0].ndim == 2:
         return leaves[0]
     return torch.cat([leaf.reshape(len(leaf), -1) for leaf in leaves], -1)
-
-
-# --- relabelling before the augmentation ---------------------------------------------
-
-
-class _Early(NamedTuple):
-    """A relabelling that an augmentation behind it has to take back."""
-
-    transform: HindsightGoal
-    future: Goals | None
-    stored: dict[NestedKey, torch.Tensor | None]
-    written: Goals
-
-
-# The last one of this thread: the transforms of a buffer run one after the other.
-_early = threading.local()
-
-
-def take_back(
-    tensordict: TensorDictBase, relabeled_key: NestedKey
-) -> tuple[TensorDictBase, HindsightGoal | None]:
-    """Takes the relabelling of a batch back, for an augmentation that comes later.
-
-    Args:
-        tensordict (TensorDictBase): the batch; it stays as it is.
-        relabeled_key (NestedKey): the mark of relabelled rows.
-
-    Returns:
-        tuple: the batch with its goals and rewards as they were stored, and the
-        transform that has to be called on the augmented batch; ``None`` where the
-        batch was not relabelled.
-
-    Raises:
-        RuntimeError: the goals were changed since.
-    """
-    mark = tensordict.get(relabeled_key, None)
-    if mark is None:
-        return tensordict, None
-    early: _Early | None = _early.__dict__.pop("relabeling", None)
-    if early is None or any(
-        tensordict.get(key, None) is not leaf for key, leaf in early.written.items()
-    ):
-        raise RuntimeError(
-            "HindsightGoal relabelled this batch, and a transform changed its goals "
-            "or rewards since, so that they cannot be swapped as they were stored: "
-            "append HindsightGoal behind the augmentation"
-        )
-    out = tensordict.copy()
-    for key, leaf in early.stored.items():
-        if leaf is None:
-            del out[key]
-        else:
-            out.set(key, leaf)
-    early.transform._pending.goals = early.future
-    return out, early.transform

@@ -22,7 +22,7 @@ from torchrl.envs.transforms import DoubleToFloat, Transform
 
 from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import EntityLayout
-from torchrl_caiac.transforms import CAIACTransform, HindsightGoal
+from torchrl_caiac.transforms import CAIACTransform, HindsightGoal, TransformKeys
 
 # Goal columns 2, 0 are the cup's, column 1 the box's; observation column 4 is nobody's.
 FLAT = EntityLayout(
@@ -114,14 +114,14 @@ def vectors(td: TensorDictBase, which: str = "goal") -> torch.Tensor:
 
 
 @dataclass
-class Arm:
+class Case:
     rb: ReplayBuffer
     goals: HindsightGoal
     lengths: list[int]
     caiac: CAIACTransform | None
 
 
-def arm(
+def build_case(
     lengths: list[int],
     layout: EntityLayout = FLAT,
     *,
@@ -137,18 +137,19 @@ def arm(
     kind: type[ReplayBuffer] = ReplayBuffer,
     rb_kwargs: dict | None = None,
     **kwargs,
-) -> Arm:
+) -> Case:
     """A buffer that is filled piece by piece and has the transforms in some order."""
     content = make(lengths, layout, seed=seed, **(data or {}))
     if not ids:
         content = content.exclude("episode")
-    goals = HindsightGoal(
-        layout, reward, generator=torch.Generator().manual_seed(seed), **kwargs
-    )
+    keys = TransformKeys() if ids else TransformKeys(trajectory=None)
+    generator = torch.Generator().manual_seed(seed)
+    goals = HindsightGoal(layout, reward, generator=generator, keys=keys, **kwargs)
     augment = CAIACTransform(
         layout,
         THRESHOLD,
         generator=torch.Generator().manual_seed(seed + 1),
+        keys=keys,
         **(caiac or {}),
     )
     rb_kwargs = rb_kwargs or {}
@@ -167,11 +168,11 @@ def arm(
     known: dict[str, Transform] = {"augment": augment, "relabel": goals}
     for name in order.split(", "):
         rb.append_transform(known[name])
-    return Arm(rb, goals, lengths, augment if "augment" in order else None)
+    return Case(rb, goals, lengths, augment if "augment" in order else None)
 
 
 def check_batch(
-    case: Arm, batch: TensorDictBase, stored: TensorDictBase, *, her: int = 0
+    case: Case, batch: TensorDictBase, stored: TensorDictBase, *, her: int = 0
 ) -> None:
     """Raises where a row is anything that it may not be.
 
@@ -183,10 +184,10 @@ def check_batch(
     assert relabeled.shape == (rows, 1) and relabeled.dtype == torch.bool
     if case.caiac is None:
         assert ("caiac", "counterfactual") not in leaves(batch)
-        marks = [False] * rows
+        flags = [False] * rows
     else:
-        marks = batch["caiac", "counterfactual"][:, 0].tolist()
-        assert sum(marks) == case.caiac.num_counterfactual(rows)
+        flags = batch["caiac", "counterfactual"][:, 0].tolist()
+        assert sum(flags) == case.caiac.num_counterfactual(rows)
     ends = torch.tensor(case.lengths).cumsum(0).sub(1).tolist()
     goal, kept = vectors(batch).tolist(), vectors(stored).tolist()
     reached, origin = vectors(batch, "next").tolist(), vectors(batch, "now").tolist()
@@ -199,12 +200,12 @@ def check_batch(
     follows = ("desired_goal", "g", "reward")
     for b in range(rows):
         again = bool(relabeled[b])
-        if not marks[b]:
+        if not flags[b]:
             for key in leaves(stored):  # invariant 3
                 if not again or not any(name in follows for name in key):
                     assert torch.equal(batch[key][b], stored[key][b]), (b, key)
-        if again and marks[b]:
-            options = [reached[i] for i in range(rows) if marks[i]]
+        if again and flags[b]:
+            options = [reached[i] for i in range(rows) if flags[i]]
             assert goals.counterfactual > 0 and goal[b] in options
         elif again:
             name = int(stored["row"][b])
@@ -216,15 +217,15 @@ def check_batch(
             if b >= her:
                 options = options if goals.future else []
                 if goals.random:
-                    options += [reached[i] for i in range(rows) if not marks[i]]
+                    options += [reached[i] for i in range(rows) if not flags[i]]
             assert goal[b] in options
-        elif marks[b]:
+        elif flags[b]:
             # each entity's goal is the one that was stored beside its state
             assert goal[b] == [-1 - value for value in origin[b]]
         else:
             assert goal[b] == kept[b]
         wanted = -sum(abs(x - y) for x, y in zip(reached[b], goal[b], strict=True))
-        if again or marks[b] or float(before[b]) != 0.5:
+        if again or flags[b] or float(before[b]) != 0.5:
             assert float(gained[b]) == wanted
         else:
             assert float(gained[b]) == 0.5
@@ -244,12 +245,12 @@ def stored_rows(rb: ReplayBuffer, batch: TensorDictBase) -> TensorDictBase:
     return raw[torch.tensor([place[row] for row in batch["row"].tolist()])]
 
 
-ORDERS = ["augment, relabel", "relabel, augment", "relabel"]
+ORDERS = ["augment, relabel", "relabel"]
 shares = st.sampled_from([0.0, 0.3, 0.5, 1.0])
 
 
 @st.composite
-def settings_of_arms(draw: st.DrawFn) -> dict:
+def settings_of_cases(draw: st.DrawFn) -> dict:
     lengths = draw(st.lists(st.integers(1, 9), min_size=1, max_size=5))
     total = sum(lengths)
     future = draw(shares)
@@ -278,11 +279,11 @@ def settings_of_arms(draw: st.DrawFn) -> dict:
 
 
 @settings(max_examples=80, suppress_health_check=[HealthCheck.too_slow])
-@given(kwargs=settings_of_arms())
+@given(kwargs=settings_of_cases())
 def test_rows_are_what_they_may_be(kwargs: dict) -> None:
-    case = arm(**kwargs)
+    case = build_case(**kwargs)
     raw = case.rb.storage[:].clone()
-    twin = arm(**kwargs)
+    twin = build_case(**kwargs)
     for _ in range(2):
         batch = case.rb.sample()
         check_batch(case, batch, stored_rows(case.rb, batch))
@@ -299,7 +300,7 @@ def chi2(counts: torch.Tensor, expected: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("strategy", ["geometric", "uniform"])
 def test_offsets_of_future_goals(strategy: str) -> None:
-    case = arm([3, 12, 4], future=1.0, strategy=strategy, order="relabel")
+    case = build_case([3, 12, 4], future=1.0, strategy=strategy, order="relabel")
     rows = torch.full((40_000,), 5)  # nine more rows of the trajectory follow
     case.goals.expand(rows, {}, case.rb.storage)
     batch = case.goals(case.rb.storage[rows])
@@ -322,15 +323,15 @@ def test_shares_and_sources() -> None:
         counterfactual=0.4,
         generator=torch.Generator().manual_seed(0),
     )
-    marks = torch.arange(40).unsqueeze(-1) % 4 == 3  # anywhere, not only at the end
+    flags = torch.arange(40).unsqueeze(-1) % 4 == 3  # anywhere, not only at the end
     future = {"desired_goal": torch.zeros(40, 3)}
-    draws = [goals.generate_parameters(marks, future).source for _ in range(2000)]
+    draws = [goals.generate_parameters(flags, future).source for _ in range(2000)]
     source = torch.stack(draws)
     own = torch.arange(40)
     kind = torch.where(source < 40, 0, torch.where(source < 80, 1, 2))
     assert (source[kind == 0] == own.expand_as(source)[kind == 0]).all()
     assert (source[kind == 2] == 80 + own.expand_as(source)[kind == 2]).all()
-    mark = marks[:, 0]
+    mark = flags[:, 0]
     for group, wanted in ((~mark, (0.3, 0.2, 0.5)), (mark, (0.6, 0.4, 0.0))):
         for number, share in enumerate(wanted):
             found = (kind[:, group] == number).double().mean()
@@ -344,11 +345,11 @@ def test_shares_and_sources() -> None:
         assert chi2(counts[group], expected) < 58.3  # at most 29 degrees of freedom
 
 
-# --- arms ----------------------------------------------------------------------------
+# --- methods -------------------------------------------------------------------------
 
 
 def test_relabel_only_relabels_the_same_share_and_swaps_nothing() -> None:
-    case = arm([40, 40], batch=4000, caiac={"swap_prob": 0.0})
+    case = build_case([40, 40], batch=4000, caiac={"swap_prob": 0.0})
     batch = case.rb.sample()
     stored = stored_rows(case.rb, batch)
     assert not batch["caiac", "swapped"].any()
@@ -365,7 +366,7 @@ def test_relabel_only_relabels_the_same_share_and_swaps_nothing() -> None:
 
 
 def test_without_augmentation_the_same_share_is_random() -> None:
-    case = arm([40, 40], batch=4000, order="relabel", random=0.25)
+    case = build_case([40, 40], batch=4000, order="relabel", random=0.25)
     batch = case.rb.sample()
     relabeled = batch["hindsight", "relabeled"][:, 0]
     assert relabeled.double().mean() == pytest.approx(0.75, abs=0.04)
@@ -377,26 +378,24 @@ def test_without_augmentation_the_same_share_is_random() -> None:
 
 @pytest.mark.parametrize("layout", [FLAT, NESTED])
 def test_goals_of_counterfactual_rows_follow_the_swap(layout: EntityLayout) -> None:
-    for order in ORDERS[:2]:
-        case = arm(
-            [30, 30],
-            layout,
-            order=order,
-            batch=64,
-            counterfactual=1.0,
-            caiac={"counterfactual_ratio": 0.5},
-        )
-        batch = case.rb.sample()
-        check_batch(case, batch, stored_rows(case.rb, batch))
-        goal = vectors(batch)[32:]
-        # the cup and the box of one goal come from different rows
-        assert ((goal[:, 0] // STRIDE) != (goal[:, 2] // STRIDE)).any()
-        assert batch["hindsight", "relabeled"][32:].all()
+    case = build_case(
+        [30, 30],
+        layout,
+        batch=64,
+        counterfactual=1.0,
+        caiac={"counterfactual_ratio": 0.5},
+    )
+    batch = case.rb.sample()
+    check_batch(case, batch, stored_rows(case.rb, batch))
+    goal = vectors(batch)[32:]
+    # the cup and the box of one goal come from different rows
+    assert ((goal[:, 0] // STRIDE) != (goal[:, 2] // STRIDE)).any()
+    assert batch["hindsight", "relabeled"][32:].all()
 
 
 def test_rewards_of_the_augmentation_are_the_same() -> None:
     for layout in (FLAT, NESTED):
-        case = arm([9, 9], layout, counterfactual=0.0, data={"stale": True})
+        case = build_case([9, 9], layout, counterfactual=0.0, data={"stale": True})
         raw = case.rb.storage[:]
         case.goals.expand(torch.arange(18), {}, case.rb.storage)
         augment = CAIACTransform(layout, THRESHOLD, reward_fn=reward)
@@ -410,13 +409,11 @@ def test_rewards_of_the_augmentation_are_the_same() -> None:
 # --- HERReplayBuffer -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", ORDERS[:2])
 @pytest.mark.parametrize("swap_prob", [0.0, 1.0])
-def test_with_her_replay_buffer(order: str, swap_prob: float) -> None:
-    def build(her_ratio: float) -> Arm:
-        return arm(
+def test_with_her_replay_buffer(swap_prob: float) -> None:
+    def build(her_ratio: float) -> Case:
+        return build_case(
             [7, 4, 9],
-            order=order,
             batch=16,
             kind=HERReplayBuffer,
             rb_kwargs={
@@ -449,7 +446,7 @@ def test_with_her_replay_buffer(order: str, swap_prob: float) -> None:
 @pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
 @pytest.mark.parametrize("layout", [FLAT, NESTED])
 def test_reading_a_full_storage_changes_nothing_in_it(layout, storage) -> None:
-    case = arm([9, 9], layout, storage=storage, future=0.0, random=1.0)
+    case = build_case([9, 9], layout, storage=storage, future=0.0, random=1.0)
     raw = case.rb.storage[:].clone()
     out = case.rb[:]
     assert out["hindsight", "relabeled"].any()
@@ -458,7 +455,7 @@ def test_reading_a_full_storage_changes_nothing_in_it(layout, storage) -> None:
 
 
 def test_draw_and_apply_are_apart() -> None:
-    case = arm([9, 9])
+    case = build_case([9, 9])
     td = case.caiac(case.rb.storage[:])
     before = td.clone()
     future = case.goals.read_goals(td, torch.arange(18).flip(0))
@@ -474,7 +471,7 @@ def test_draw_and_apply_are_apart() -> None:
 
 def test_under_prefetch_and_in_a_tensordict_buffer() -> None:
     for order in ORDERS:
-        case = arm(
+        case = build_case(
             [9, 9, 9], order=order, kind=TensorDictReplayBuffer, prefetch=3, batch=6
         )
         for _ in range(10):
@@ -483,7 +480,7 @@ def test_under_prefetch_and_in_a_tensordict_buffer() -> None:
 
 
 def test_writes_between_samples() -> None:
-    case = arm([9, 9, 9], size=10, future=1.0, order="relabel")
+    case = build_case([9, 9, 9], size=10, future=1.0, order="relabel")
     for begin in range(3):
         batch = case.rb.sample()
         check_batch(case, batch, stored_rows(case.rb, batch))
@@ -494,7 +491,8 @@ def test_writes_between_samples() -> None:
 
 def test_stored_achieved_goals_and_flat_rewards() -> None:
     layout = EntityLayout({"arm": [0], "cup": [1]}, goal={"arm": (), "cup": [0]})
-    goals = HindsightGoal(layout, reward, future=1.0, p=1.0, reward_key="r")
+    keys = TransformKeys(reward="r", trajectory=None)
+    goals = HindsightGoal(layout, reward, future=1.0, p=1.0, keys=keys)
     rb = ReplayBuffer(storage=LazyTensorStorage(6), sample_unit=goals, batch_size=6)
     rb.append_transform(goals)
     data = TensorDict(
@@ -516,24 +514,26 @@ def test_stored_achieved_goals_and_flat_rewards() -> None:
 
 
 def test_renamed_keys() -> None:
-    augment = CAIACTransform(FLAT, counterfactual_key="cf", relabeled_key=("a", "b"))
+    keys = TransformKeys(counterfactual="cf", relabeled=("a", "b"))
+    augment = CAIACTransform(FLAT, keys=keys)
     goals = HindsightGoal(
         FLAT,
         reward,
         future=0.0,
         counterfactual=1.0,
-        counterfactual_key="cf",
-        relabeled_key=("a", "b"),
+        keys=keys,
     )
     td = make([8])
     td["caiac", "score"].zero_()
-    for out in (goals(augment(td)), augment(goals(td))):
-        assert out["a", "b"][:, 0].tolist() == [False] * 4 + [True] * 4
-        assert out["cf"][4:].all()
+    out = goals(augment(td))
+    assert out["a", "b"][:, 0].tolist() == [False] * 4 + [True] * 4
+    assert out["cf"][4:].all()
+    with pytest.raises(RuntimeError, match="CAIACTransform first, HindsightGoal after"):
+        augment(goals(td))
 
 
 def test_pickle_and_clone() -> None:
-    case = arm([9, 9], future=1.0, p=1.0)
+    case = build_case([9, 9], future=1.0, p=1.0)
     for copy in (pickle.loads(pickle.dumps(case.goals)), case.goals.clone()):
         rb = ReplayBuffer(storage=case.rb.storage, sample_unit=copy, batch_size=4)
         rb.append_transform(copy)
@@ -554,7 +554,7 @@ def test_pickle_and_clone() -> None:
         ({"counterfactual": True}, TypeError, "counterfactual is a number"),
         ({"future": 0.6, "random": 0.5}, ValueError, "at most 1 together"),
         ({"strategy": "last"}, ValueError, "'geometric' or 'uniform'"),
-        ({"p": 0.0}, ValueError, r"lies in \(0, 1\]"),
+        ({"p": 0.0}, ValueError, r"is in \(0, 1\]"),
         ({"reward_fn": 1.0}, TypeError, "reward_fn is a function"),
         ({"generator": 0}, TypeError, "generator is a torch.Generator"),
         ({"layout": {"cup": [0]}}, TypeError, "layout is an EntityLayout"),
@@ -572,27 +572,24 @@ def test_arguments(arguments: dict, error: type, match: str) -> None:
 
 
 def test_without_a_sample_unit() -> None:
-    case = arm([9, 9])
+    case = build_case([9, 9])
     with pytest.raises(RuntimeError, match="sample_unit="):
         case.rb[:]
     case.goals.expand(torch.arange(3), {}, case.rb.storage)
     with pytest.raises(RuntimeError, match="drawn for 3 rows, but the batch has 18"):
         case.goals(case.rb.storage[:])
-    twice = arm([9, 9], future=0.0, order="augment, relabel, relabel")
-    with pytest.raises(RuntimeError, match="relabelled already"):
+    twice = build_case([9, 9], future=0.0, order="augment, relabel, relabel")
+    with pytest.raises(RuntimeError, match="already relabelled"):
         twice.rb.sample()
 
 
-def test_goals_that_changed_before_the_augmentation() -> None:
-    case = arm([9, 9], order="relabel", data={"dtype": torch.double})
-    case.rb.append_transform(DoubleToFloat(in_keys=["desired_goal"]))
-    case.rb.append_transform(CAIACTransform(FLAT))
-    with pytest.raises(RuntimeError, match="append HindsightGoal behind the augment"):
-        case.rb.sample()
-    # a mark of a batch from elsewhere
-    td = HindsightGoal(FLAT, reward, future=0.0)(make([9])).clone()
-    with pytest.raises(RuntimeError, match="append HindsightGoal behind the augment"):
-        CAIACTransform(FLAT)(td)
+def test_before_the_augmentation_it_is_refused() -> None:
+    for between in ([], [DoubleToFloat(in_keys=["desired_goal"])]):
+        case = build_case([9, 9], order="relabel", data={"dtype": torch.double})
+        for transform in (*between, CAIACTransform(FLAT)):
+            case.rb.append_transform(transform)
+        with pytest.raises(RuntimeError, match="HindsightGoal after it"):
+            case.rb.sample()
 
 
 def test_data_that_do_not_fit() -> None:
@@ -600,13 +597,13 @@ def test_data_that_do_not_fit() -> None:
     td = make([9])
     with pytest.raises(KeyError, match="no desired goals in 'desired_goal'"):
         goals(td.exclude("desired_goal"))
-    with pytest.raises(KeyError, match=r"no \('next', 'reward'\).*reward_key"):
+    with pytest.raises(KeyError, match=r"no \('next', 'reward'\).*TransformKeys"):
         goals(td.exclude(("next", "reward")))
-    with pytest.raises(KeyError, match=r"read from \('next', 'observation'\)"):
+    with pytest.raises(KeyError, match=r"read from, .*next.*observation"):
         goals(td.exclude(("next", "observation")))
     with pytest.raises(ValueError, match=r"wanted \[B\]"):
         goals(td.view(3, 3))
-    with pytest.raises(ValueError, match=r"\[9, 2\], wanted \[9, 1\]: one reward"):
+    with pytest.raises(ValueError, match=r"\[9, 2\], expected \[9, 1\]: one reward"):
         goals(td.clone().set(("next", "reward"), torch.zeros(9, 2)))
     with pytest.raises(
         ValueError, match=r"'desired_goal' has shape \[9, 2\].*\[9, 3\]"
@@ -614,16 +611,16 @@ def test_data_that_do_not_fit() -> None:
         goals(td.clone().set("desired_goal", torch.zeros(9, 2)))
     with pytest.raises(ValueError, match=r"counterfactual'\) has shape \[9\]"):
         goals(td.clone().set(("caiac", "counterfactual"), torch.zeros(9)))
-    with pytest.raises(ValueError, match=r"reward_fn returned \[\].*wanted \[9\]"):
+    with pytest.raises(ValueError, match=r"reward_fn returned \[\].*expected \[9\]"):
         HindsightGoal(FLAT, lambda a, d: (a - d).sum(), future=0.0)(td)
     wide = td.clone().set(("next", "observation"), torch.zeros(9, 1, 5))
     with pytest.raises(ValueError, match="5 columns in 3 dimensions"):
         goals(wide)
-    case = arm([9, 9], NESTED)
+    case = build_case([9, 9], NESTED)
     nested = case.rb.storage[:].exclude(("next", "s", "box"))
-    with pytest.raises(KeyError, match="goals of 'box' are read"):
+    with pytest.raises(KeyError, match=r"goals of .*box.* are read"):
         HindsightGoal(NESTED, reward, future=0.0)(nested)
-    with pytest.raises(KeyError, match="neither trajectory ids"):
+    with pytest.raises(KeyError, match="lack the trajectory ids"):
         rb = ReplayBuffer(storage=LazyTensorStorage(9))
         rb.extend(td.exclude("episode", ("next", "done")))
         HindsightGoal(FLAT, reward).expand(torch.arange(3), {}, rb.storage)

@@ -17,7 +17,7 @@ from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer
 from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
-from torchrl_caiac.transforms.late_check import LateCheck
+from torchrl_caiac.transforms.checks import LateCheck
 
 FLAT = EntityLayout(
     {"arm": [0], "cup": [1, 2], "box": [4]},  # column 3 is nobody's
@@ -137,7 +137,9 @@ def buffer(
         source = (
             HindsightGoal(layout, reward, random=0.2, strategy="uniform")
             if window == 1
-            else WindowGoal(layout, WINDOW, {"last": 1, "uniform": 1, "geometric": 1})
+            else WindowGoal(
+                layout, WINDOW, mixture={"last": 1, "uniform": 1, "geometric": 1}
+            )
         )
     rb = ReplayBuffer(
         storage=storage,
@@ -194,7 +196,7 @@ def test_a_late_error_names_the_leaf(key: Any) -> None:
     bad[key][5, 3] = math.inf
     transform(good)
     transform(bad)
-    with pytest.raises(ValueError, match=r"observation.* in a batch that was sampled"):
+    with pytest.raises(ValueError, match=r"observation.* in an earlier batch"):
         transform(good)
     transform(good)  # what was told is over
     transform(good)
@@ -290,6 +292,6 @@ def test_errors_come_late_on_the_gpu() -> None:
     with nothing_waits():
         transform(bad)
     torch.cuda.synchronize()
-    with pytest.raises(ValueError, match=r"observation.* in a batch that was sampled"):
+    with pytest.raises(ValueError, match=r"observation.* in an earlier batch"):
         transform(good)
     transform(good)

@@ -1,4 +1,4 @@
-"""Goals from the future of a trajectory: what goals of all kinds share."""
+"""Goals from the future of a trajectory: what the goals of all kinds share."""
 
 from __future__ import annotations
 
@@ -8,23 +8,19 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers import SampleUnit
 from torchrl.envs.transforms import Transform
 
-from torchrl_caiac._random import draw_numbers
-from torchrl_caiac.entities import EntityLayout, _path
-from torchrl_caiac.transforms.donors import (
-    _RANDOM_BITS,
-    StorageCache,
-    TrajectoryIndex,
-    _pick,
-    _plain,
-    _take,
-    goal_columns,
-    trajectory_index,
-)
+from torchrl_caiac._keys import join, missing_key, path
+from torchrl_caiac._random import draw_integers, draw_numbers
+from torchrl_caiac._torchrl import storage_data
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.trajectories import TrajectoryCache, TrajectoryIndex
+from torchrl_caiac.transforms.checks import check_generator, check_layout
+from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
+from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = ["FutureGoal", "draw_goal_offset"]
 
@@ -36,14 +32,14 @@ def draw_goal_offset(
     p: float = 0.3,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draws how many rows beyond a window the row lies whose next state is its goal.
+    """Draws how many rows after its window the goal of each window is.
 
     Offset 0 is the window's last row, whose next state is the first one after the
     window. Three strategies are mixed, window by window: ``last`` takes the
     trajectory's last row, ``uniform`` any row from the window's last one on, and
     ``geometric`` the state ``k >= 1`` steps after the window's last one with
     probability ``p * (1 - p) ** (k - 1)``, or the last one if the trajectory ends
-    before.
+    before it.
 
     Args:
         remaining (torch.Tensor): int64 ``[*]``, rows of the trajectory after the
@@ -59,7 +55,7 @@ def draw_goal_offset(
 
     Examples:
         >>> import torch
-        >>> from torchrl_caiac.transforms.future_goal import draw_goal_offset
+        >>> from torchrl_caiac.transforms.goals.future import draw_goal_offset
         >>> draw_goal_offset(torch.tensor([4, 0]), {"last": 1.0})
         tensor([4, 0])
     """
@@ -74,12 +70,8 @@ def draw_goal_offset(
     for name, weight in weights.items():
         drawn = remaining
         if name == "uniform":
-            drawn = draw_numbers(
-                torch.randint,
-                _RANDOM_BITS,
-                remaining.shape,
-                device=device,
-                generator=generator,
+            drawn = draw_integers(
+                remaining.shape, device=device, generator=generator
             ) % (remaining + 1)
         elif name == "geometric":
             drawn = torch.minimum(
@@ -111,7 +103,7 @@ def _geometric(
 
 
 class FutureGoal(Transform, SampleUnit):
-    """Reads goals from a storage and hands them from ``expand`` to ``forward``.
+    """Draws goals from a storage in ``expand``, for ``forward`` to write.
 
     The base of :class:`~torchrl_caiac.transforms.WindowGoal` and
     :class:`~torchrl_caiac.transforms.HindsightGoal`, which are both the
@@ -122,10 +114,8 @@ class FutureGoal(Transform, SampleUnit):
 
     Keyword Args:
         p (float): the parameter of the geometric distribution.
-        trajectory_key (NestedKey): trajectory ids in the storage.
-        done_key (NestedKey): end flags, read where there are no ids.
-        counterfactual_key (NestedKey): the mark of counterfactual rows.
         generator (torch.Generator, optional): source of randomness.
+        keys (TransformKeys, optional): the keys other than those of the layout.
 
     Raises:
         TypeError: an argument has the wrong type.
@@ -137,20 +127,13 @@ class FutureGoal(Transform, SampleUnit):
         layout: EntityLayout,
         *,
         p: float,
-        trajectory_key: NestedKey,
-        done_key: NestedKey,
-        counterfactual_key: NestedKey,
         generator: torch.Generator | None,
+        keys: TransformKeys | None,
     ) -> None:
         super().__init__()
-        if not isinstance(layout, EntityLayout):
-            raise TypeError(f"layout is an EntityLayout, got {type(layout).__name__}")
-        if generator is not None and not isinstance(generator, torch.Generator):
-            raise TypeError(
-                f"generator is a torch.Generator, got {type(generator).__name__}"
-            )
+        check_layout(layout)
         if not 0 < p <= 1:
-            raise ValueError(f"p, of the geometric strategy, lies in (0, 1], got {p!r}")
+            raise ValueError(f"p, of the geometric strategy, is in (0, 1], got {p!r}")
         if not any(layout.goal.values()):
             raise ValueError(
                 "the layout has no goals: give EntityLayout(..., goal=..., "
@@ -169,27 +152,51 @@ class FutureGoal(Transform, SampleUnit):
                 )
         self.layout = layout
         self.p = float(p)
-        self.trajectory_key = unravel_key(trajectory_key)
-        self.done_key = unravel_key(done_key)
-        self.counterfactual_key = unravel_key(counterfactual_key)
-        self.generator = generator
+        self.generator = check_generator(generator)
+        self.keys = keys or TransformKeys()
         if layout.is_flat and layout.achieved:
-            columns = goal_columns(layout)
-            self._goal_columns = (layout.next(layout.observation_key), columns)
+            key: NestedKey = layout.next(layout.observation_key)
+            self._goal_columns = key, _mirrored_columns(layout)
         elif layout.is_flat:
             columns = list(range(layout.goal_width))
-            self._goal_columns = (layout.next(layout.achieved_goal_key), columns)
+            self._goal_columns = layout.next(layout.achieved_goal_key), columns
         self._reset_state()
 
     def _reset_state(self) -> None:
-        # By thread: a buffer prefetches in threads, and draws and applies in the same.
+        # By thread: a buffer prefetches in threads, each of which draws and applies.
         self._pending = threading.local()
-        self._cache = StorageCache(self._trajectories)
-
-    def _trajectories(self, storage: TensorStorage) -> TrajectoryIndex:
-        return trajectory_index(
-            storage, trajectory_key=self.trajectory_key, done_key=self.done_key
+        self._cache = TrajectoryCache(
+            trajectory_key=self.keys.trajectory, done_key=self.keys.done
         )
+        self._columns: dict[torch.device, torch.Tensor] = {}
+
+    @property
+    def goal_keys(self) -> list[NestedKey]:
+        """The desired goals of the layout."""
+        if self.layout.is_flat:
+            return [self.layout.desired_goal_key]
+        return [key for key in self.layout.goal.values() if key is not None]
+
+    @property
+    def achieved_keys(self) -> list[NestedKey]:
+        """The leaves, of the next state, that goals are read from."""
+        if self.layout.is_flat:
+            return [self._goal_columns[0]]
+        layout = self.layout
+        return [layout.next(k) for k in layout.achieved.values() if k is not None]
+
+    def stored(self, storage: Any) -> tuple[TensorDictBase, TrajectoryIndex]:
+        """Returns the data of the buffer's storage, and its trajectories.
+
+        Args:
+            storage (TensorStorage): what is sampled.
+
+        Returns:
+            tuple: the storage's own tensordict, and the index.
+        """
+        data = storage_data(storage, "the buffer")
+        assert isinstance(storage, TensorStorage)  # else storage_data raised
+        return data, self._cache.get(storage)
 
     def set_generator(self, generator: torch.Generator | None) -> None:
         """Sets the source of randomness.
@@ -201,13 +208,27 @@ class FutureGoal(Transform, SampleUnit):
 
     # --- reading ---------------------------------------------------------------------
 
-    def _flat_source(self, data: TensorDictBase) -> tuple[torch.Tensor, list[int]]:
+    def flat_source(self, data: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the leaf that a flat layout's goals are read from, and the columns.
+
+        Args:
+            data (TensorDictBase): the data, ``[T]``.
+
+        Returns:
+            tuple of torch.Tensor: ``[T, D]``, and int64 ``[G]`` on the same device.
+
+        Raises:
+            KeyError: the data lack the leaf.
+            ValueError: it has too few columns.
+        """
         key, columns = self._goal_columns
         source = data.get(key, None)
         if source is None:
-            raise KeyError(
-                f"goals are read from {key!r}, which the data lacks: give the layout "
-                "`achieved` columns, or store the achieved goals"
+            raise missing_key(
+                data,
+                key,
+                "the data lack the leaf that goals are read from,",
+                "give the layout `achieved` columns, or store the achieved goals",
             )
         if source.ndim != 2 or source.shape[-1] <= max(columns):
             raise ValueError(
@@ -215,17 +236,35 @@ class FutureGoal(Transform, SampleUnit):
                 f"but the layout's goals need [T, D] with at least {max(columns) + 1}: "
                 "correct the layout, or the data"
             )
-        return _plain(source), columns
+        where = self._columns.get(source.device)
+        if where is None:
+            where = torch.tensor(columns, device=source.device)
+            self._columns[source.device] = where
+        return plain_tensor(source), where
 
-    def _nested_source(self, data: TensorDictBase, name: str) -> Any:
+    def nested_source(self, data: TensorDictBase, name: str) -> Any:
+        """Returns the leaf or tensordict that an entity's goal is read from.
+
+        Args:
+            data (TensorDictBase): the data, ``[T]``.
+            name (str): the entity.
+
+        Returns:
+            torch.Tensor or TensorDictBase: ``[T, ...]``.
+
+        Raises:
+            KeyError: the data lack it.
+        """
         key = self.layout.next(self.layout.achieved[name])
         source = data.get(key, None)
         if source is None:
-            raise KeyError(
-                f"the goals of {name!r} are read from {key!r}, which the data lacks: "
-                "correct `achieved` in EntityLayout.from_keys"
+            raise missing_key(
+                data,
+                key,
+                f"the data lack the leaf that the goals of {name!r} are read from,",
+                "correct `achieved` in EntityLayout.from_keys",
             )
-        return _plain(source) if isinstance(source, torch.Tensor) else source
+        return plain_tensor(source) if isinstance(source, torch.Tensor) else source
 
     def read_goals(
         self, data: TensorDictBase, rows: torch.Tensor | None = None
@@ -245,27 +284,26 @@ class FutureGoal(Transform, SampleUnit):
         """
         layout = self.layout
         if layout.is_flat:
-            source, columns = self._flat_source(data)
-            where = layout._index_tensor("goal", columns, source.device)
+            source, where = self.flat_source(data)
             if rows is None:
                 goals = source.gather(1, where.expand(source.shape[0], -1))
             else:
                 places = rows.to(source.device).unsqueeze(-1) * source.shape[-1] + where
-                goals = _take(source, places.flatten(), where)
+                goals = pick_places(source, places.flatten()).view(places.shape)
             return {layout.desired_goal_key: goals}
         found: dict[NestedKey, torch.Tensor] = {}
         for name in layout.names:
             key = layout.goal.get(name)
             if key is None:
                 continue
-            source = self._nested_source(data, name)
+            source = self.nested_source(data, name)
             if isinstance(source, torch.Tensor):
                 found[key] = source
                 continue
-            for below in sorted(map(_path, source.keys(True, True))):
-                found[(*_path(key), *below)] = _plain(source.get(below))
+            for below in sorted(map(path, source.keys(True, True))):
+                found[join(key, below)] = plain_tensor(source.get(below))
         if rows is not None:
-            found = {key: _pick(leaf, rows) for key, leaf in found.items()}
+            found = {key: pick_rows(leaf, rows) for key, leaf in found.items()}
         return found
 
     # --- copying ---------------------------------------------------------------------
@@ -281,9 +319,19 @@ class FutureGoal(Transform, SampleUnit):
 
     def __getstate__(self) -> dict[str, Any]:
         state: dict[str, Any] = super().__getstate__()
-        del state["_pending"], state["_cache"]
+        del state["_pending"], state["_cache"], state["_columns"]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._reset_state()
+
+
+def _mirrored_columns(layout: EntityLayout) -> list[int]:
+    """The observation column that each goal column of a flat layout mirrors."""
+    mirrored = {
+        goal: observed
+        for name, columns in layout.goal.items()
+        for goal, observed in zip(columns, layout.achieved[name], strict=True)
+    }
+    return [mirrored[column] for column in range(layout.goal_width)]

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
-from torchrl_caiac.transforms.future_goal import FutureGoal, draw_goal_offset
+from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
 
 FLAT = EntityLayout(
     {"arm": [0], "cup": [3, 1]},

@@ -19,7 +19,7 @@ from torchrl.data import (
 )
 
 from torchrl_caiac import EntityLayout
-from torchrl_caiac.transforms import CAIACTransform, WindowGoal
+from torchrl_caiac.transforms import CAIACTransform, TransformKeys, WindowGoal
 
 LAYOUT = EntityLayout(
     {"arm": [0], "cup": [1, 2]},
@@ -119,6 +119,7 @@ def test_goals_are_later_states_of_the_same_trajectory(
         window,
         mixture={"last": 1, "uniform": 1, "geometric": 1},
         generator=torch.Generator().manual_seed(seed),
+        keys=TransformKeys() if traj else TransformKeys(trajectory=None),
     )
     rb = buffer(
         goals,
@@ -152,6 +153,7 @@ def test_goals_are_later_states_of_the_same_trajectory(
 def test_last_respects_writes_and_the_cursor() -> None:
     goals = WindowGoal(LAYOUT, 2, mixture={"last": 1.0})
     rb = buffer(goals, [6], size=8, batch=4)
+    rb.storage[:]["next", "done"].zero_()  # it goes on
     assert (rb.sample()["desired_goal"][:, 1] == 61).all()
     more = make([9])[6:9]  # the same trajectory goes on; row 0 is overwritten
     rb.extend(more)
@@ -222,15 +224,14 @@ def test_pickle_and_clone() -> None:
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"window": 0}, "window is a number of rows"),
-        ({"window": True}, "window is a number of rows"),
+        ({"window": 0}, "window is at least 1 row"),
         ({"mixture": {}}, "mixture maps strategies"),
         ({"mixture": {"first": 1.0}}, "mixture maps strategies"),
         ({"mixture": {"last": -1.0}}, "weights of mixture"),
         ({"mixture": {"last": 0.0}}, "weights of mixture"),
         ({"mixture": {"last": math.nan}}, "weights of mixture"),
-        ({"p": 0.0}, r"lies in \(0, 1\]"),
-        ({"p": 1.1}, r"lies in \(0, 1\]"),
+        ({"p": 0.0}, r"is in \(0, 1\]"),
+        ({"p": 1.1}, r"is in \(0, 1\]"),
         ({"layout": EntityLayout({"cup": [0]})}, "no goals"),
         (
             {"layout": EntityLayout.from_keys({"cup": "c"}, goal={"cup": "g"})},
@@ -241,6 +242,12 @@ def test_pickle_and_clone() -> None:
 def test_arguments(arguments: dict, match: str) -> None:
     with pytest.raises(ValueError, match=match):
         WindowGoal(**{"layout": LAYOUT, "window": 2, **arguments})
+
+
+def test_window_is_an_int() -> None:
+    for window in (True, 2.0):
+        with pytest.raises(TypeError, match="window is a number of rows, an int"):
+            WindowGoal(LAYOUT, window)
 
 
 def test_without_a_draw_or_after_the_augmentation() -> None:
@@ -254,9 +261,9 @@ def test_without_a_draw_or_after_the_augmentation() -> None:
         sample_unit=goals,
         batch_size=4,
     )
+    rb.extend(make([6]))
     rb.append_transform(CAIACTransform(LAYOUT, window=2))
     rb.append_transform(goals)
-    rb.extend(make([6]))
     with pytest.raises(RuntimeError, match="append WindowGoal before"):
         rb.sample()
     goals.expand(torch.tensor([0, 1]), {}, rb.storage)
@@ -285,16 +292,16 @@ def test_data_that_do_not_fit() -> None:
         goals.expand(torch.tensor([0]), {}, rb.storage)
 
     data = make([5])
-    with pytest.raises(KeyError, match="neither trajectory ids"):
+    with pytest.raises(KeyError, match="lack the trajectory ids"):
         draw(data.exclude("episode", ("next", "done")))
     with pytest.raises(KeyError, match="goals are read from"):
         draw(data.exclude(("next", "observation")))
-    with pytest.raises(KeyError, match="goals of 'cup' are read"):
+    with pytest.raises(KeyError, match=r"goals of .*cup.* are read"):
         draw(data, WindowGoal(NESTED, 1))
     data["next", "observation"] = torch.zeros(5, 2)
     with pytest.raises(ValueError, match=r"2 columns.*at least 3"):
         draw(data)
     with pytest.raises(ValueError, match="buffer is empty"):
         goals.expand(torch.tensor([0]), {}, LazyTensorStorage(3))
-    with pytest.raises(TypeError, match="one-dimensional TensorStorage"):
+    with pytest.raises(TypeError, match="is a ListStorage, wanted one"):
         goals.expand(torch.tensor([0]), {}, ListStorage(3))

@@ -10,16 +10,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._keys import path
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.transforms.donors import (
-    TrajectoryIndex,
-    _pick,
-    _plain,
-    _storage_td,
-    _take,
-)
-from torchrl_caiac.transforms.future_goal import FutureGoal, _path, draw_goal_offset
-from torchrl_caiac.transforms.late_check import LateCheck
+from torchrl_caiac.trajectories import TrajectoryIndex
+from torchrl_caiac.transforms.checks import LateCheck, check_window
+from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
+from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
+from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = ["WindowGoal"]
 
@@ -29,38 +26,34 @@ _STRATEGIES = ("last", "uniform", "geometric")
 class WindowGoal(FutureGoal):
     """Gives each window a goal: the goal achieved in a later state of its trajectory.
 
-    One object does two things in a replay buffer. As its ``sample_unit`` it sees the
-    rows that were sampled and draws a goal for each window; as a transform it writes
-    these goals into the batch, the same for all rows of a window. Append it before
-    :class:`~torchrl_caiac.CAIACTransform`, which then swaps goals with entities.
+    Pass the same object to a replay buffer twice: as its ``sample_unit``, in which it
+    sees the sampled rows and draws a goal for each window, and as a transform, in which
+    it writes these goals into the batch, the same for all rows of a window. Append it
+    before :class:`~torchrl_caiac.CAIACTransform`, which then swaps goals with entities.
 
-    The goal is that of the *next* state of a row (the state reached), so the last
-    state of a trajectory can be a goal. Goals are read from ``layout.achieved``
+    The goal is that of the *next* state of a row (the state that is reached), so the
+    last state of a trajectory can be a goal. Goals are read from ``layout.achieved``
     columns of the next observation, or from the stored next achieved goal where the
     layout names no such columns; a nested layout reads its ``achieved`` leaves and
     writes its ``goal`` leaves.
 
-    Trajectories shorter than ``window`` are never sampled by
-    :class:`~torchrl.data.SliceSampler` with ``strict_length=True`` (its default),
-    which raises when there is no longer one.
+    :class:`~torchrl.data.SliceSampler` with ``strict_length=True`` (its default) never
+    samples trajectories shorter than ``window``, and raises if there is no longer one.
 
     Args:
         layout (EntityLayout): the entities and their goals.
-        window (int): rows a window, κ; 1 for transitions.
-        mixture (mapping of str to float, optional): the weights of the strategies
-            ``"last"``, ``"uniform"`` and ``"geometric"``, see
-            :func:`~torchrl_caiac.transforms.future_goal.draw_goal_offset`. Defaults to
-            half ``"last"``, half ``"geometric"``.
-        p (float): the parameter of ``"geometric"``. Defaults to 0.3.
-        trajectory_key (NestedKey): trajectory ids in the storage. Defaults to
-            ``"episode"``; without such a leaf, trajectories end at ``done_key``.
+        window (int): rows in a window, κ; 1 for transitions.
 
     Keyword Args:
-        done_key (NestedKey): end flags. Defaults to ``("next", "done")``.
-        generator (torch.Generator, optional): source of randomness; the default
-            generator of torch without it.
-        counterfactual_key (NestedKey): the mark of the augmentation that must come
-            later. Defaults to ``("caiac", "counterfactual")``.
+        mixture (mapping of str to float, optional): the weights of the strategies
+            ``"last"``, ``"uniform"`` and ``"geometric"``, see
+            :func:`~torchrl_caiac.transforms.goals.future.draw_goal_offset`. Defaults
+            to half ``"last"``, half ``"geometric"``.
+        p (float): the parameter of ``"geometric"``. Defaults to 0.3.
+        generator (torch.Generator, optional): source of randomness. Defaults to
+            torch's default generator.
+        keys (TransformKeys, optional): trajectory ids, end flags, and the flag of the
+            augmentation that must come later. Defaults to ``TransformKeys()``.
 
     Raises:
         ValueError: an argument is out of range, or the layout has no goals.
@@ -95,28 +88,16 @@ class WindowGoal(FutureGoal):
         self,
         layout: EntityLayout,
         window: int,
+        *,
         mixture: Mapping[str, float] | None = None,
         p: float = 0.3,
-        trajectory_key: NestedKey = "episode",
-        *,
-        done_key: NestedKey = ("next", "done"),
         generator: torch.Generator | None = None,
-        counterfactual_key: NestedKey = ("caiac", "counterfactual"),
+        keys: TransformKeys | None = None,
     ) -> None:
-        super().__init__(
-            layout,
-            p=p,
-            trajectory_key=trajectory_key,
-            done_key=done_key,
-            counterfactual_key=counterfactual_key,
-            generator=generator,
-        )
+        super().__init__(layout, p=p, generator=generator, keys=keys)
         if mixture is None:
             mixture = {"last": 0.5, "geometric": 0.5}
-        if isinstance(window, bool) or not isinstance(window, int) or window < 1:
-            raise ValueError(
-                f"window is a number of rows of at least 1, got {window!r}"
-            )
+        self.window = check_window(window)
         unknown = [name for name in mixture if name not in _STRATEGIES]
         if unknown or not mixture:
             raise ValueError(
@@ -129,8 +110,8 @@ class WindowGoal(FutureGoal):
                 "the weights of mixture are at least 0, finite, and not all 0; got "
                 f"{dict(mixture)}"
             )
-        self.window = window
         self.mixture = dict(mixture)
+        self.out_keys = self.goal_keys
 
     def _reset_state(self) -> None:
         super()._reset_state()
@@ -157,11 +138,11 @@ class WindowGoal(FutureGoal):
         Returns:
             torch.Tensor: int64 ``[*]``, rows of the same storage.
         """
-        rows = last.to(trajectories.ends.device)
+        rows = last.to(trajectories.device)
         offset = draw_goal_offset(
             trajectories.remaining(rows), self.mixture, p=self.p, generator=generator
         )
-        return ((rows + offset) % trajectories.length).to(last.device)
+        return trajectories.later(rows, offset).to(last.device)
 
     def expand(
         self,
@@ -184,7 +165,6 @@ class WindowGoal(FutureGoal):
                 device this comes with a later sample, so that none is waited for.
         """
         rows = index[0] if isinstance(index, tuple) else index
-        data = _storage_td(storage, "the buffer")
         rows = rows.reshape(-1)
         if rows.shape[0] % self.window:
             raise ValueError(
@@ -193,8 +173,8 @@ class WindowGoal(FutureGoal):
                 f"SliceSampler(slice_len={self.window}), of a batch size that is a "
                 "multiple of it"
             )
-        trajectories = self._cache.get(storage)
-        rows = rows.to(trajectories.ends.device)
+        data, trajectories = self.stored(storage)
+        rows = rows.to(trajectories.device)
         windows = rows.view(-1, self.window)
         first, last = windows[:, 0], windows[:, -1]
         remaining = trajectories.remaining(first) - (self.window - 1)
@@ -204,8 +184,7 @@ class WindowGoal(FutureGoal):
         offset = draw_goal_offset(
             remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
         )
-        goal_rows = (last + offset) % trajectories.length
-        self._pending.goals = self.read_goals(data, goal_rows)
+        self._pending.goals = self.read_goals(data, trajectories.later(last, offset))
         return index, info
 
     def _check_windows(
@@ -216,9 +195,7 @@ class WindowGoal(FutureGoal):
     ) -> None:
         """Raises where rows are no windows: on an accelerator, some samples later."""
         steps = torch.arange(self.window, device=windows.device)
-        follow = windows[:, :1] + steps
-        if trajectories.oldest:
-            follow %= trajectories.length
+        follow = trajectories.later(windows[:, :1], steps)
         broken = (windows != follow).any() | (remaining < 0).any()
         if LateCheck.needed(windows.device):
             found = bool(self._late.found())
@@ -230,14 +207,14 @@ class WindowGoal(FutureGoal):
                 f"the sampler drew windows of {self.window} rows that are not "
                 "consecutive rows of one trajectory: use SliceSampler with "
                 f"slice_len={self.window} and strict_length=True, and trajectories "
-                f"in {self.trajectory_key!r}"
+                f"in {self.keys.trajectory!r}"
             )
 
     def donor_goals(
         self,
         donors: TensorDictBase,
         rows: torch.Tensor,
-        entity: int | torch.Tensor,
+        owner: int | torch.Tensor,
         key: NestedKey,
     ) -> torch.Tensor:
         """Reads the goals that entities take over from donor windows.
@@ -245,26 +222,25 @@ class WindowGoal(FutureGoal):
         Args:
             donors (TensorDictBase): the donors' data, ``[T]``.
             rows (torch.Tensor): int64 ``[C, N]``, the rows drawn for each entity.
-            entity (int or torch.Tensor): the one entity, or the entity of each goal
+            owner (int or torch.Tensor): the one entity, or the entity of each goal
                 column, int64 ``[G]``.
             key (NestedKey): the desired goal's key.
 
         Returns:
             torch.Tensor: ``[C, G]``, or ``[C, ...]`` for one entity.
         """
-        if isinstance(entity, torch.Tensor):
-            source, columns = self._flat_source(donors)
-            where = self.layout._index_tensor("goal", columns, source.device)
-            rows = rows.gather(1, entity.to(rows.device).expand(rows.shape[0], -1))
+        if isinstance(owner, torch.Tensor):
+            source, where = self.flat_source(donors)
+            rows = rows.gather(1, owner.to(rows.device).expand(rows.shape[0], -1))
             places = rows.to(source.device) * source.shape[-1] + where
-            return _take(source, places.flatten(), where)
-        name = self.layout.names[entity]
+            return pick_places(source, places.flatten()).view(places.shape)
+        name = self.layout.names[owner]
         base = self.layout.goal[name]
-        source = self._nested_source(donors, name)
+        source = self.nested_source(donors, name)
         below = _below(key, base, self.layout.next(base))
         if below:
-            source = _plain(source.get(below))
-        return _pick(source, rows[:, entity])
+            source = plain_tensor(source.get(below))
+        return pick_rows(source, rows[:, owner])
 
     # --- writing ---------------------------------------------------------------------
 
@@ -289,7 +265,7 @@ class WindowGoal(FutureGoal):
                 "sample_unit=... of the replay buffer, and get data by rb.sample() "
                 "(rb.storage[...] reads rows as they are stored)"
             )
-        if tensordict.get(self.counterfactual_key, None) is not None:
+        if tensordict.get(self.keys.counterfactual, None) is not None:
             raise RuntimeError(
                 "the batch holds counterfactuals already, whose goals would not follow "
                 "the swap: append WindowGoal before the augmentation"
@@ -318,9 +294,9 @@ class WindowGoal(FutureGoal):
 
 
 def _below(key: NestedKey, *bases: NestedKey) -> tuple[str, ...]:
-    path = _path(key)
+    parts = path(key)
     for base in bases:
-        start = _path(base)
-        if path[: len(start)] == start:
-            return path[len(start) :]
+        start = path(base)
+        if parts[: len(start)] == start:
+            return parts[len(start) :]
     raise ValueError(f"{key!r} lies under none of {bases}")

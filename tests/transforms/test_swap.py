@@ -1,0 +1,140 @@
+"""Plans of swaps: made once for each structure of a batch, by the leaves there are."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.transforms.draws import SwapDraw
+from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
+
+FLAT = EntityLayout(
+    {"arm": [0], "cup": [1, 2]},
+    goal={"cup": [0, 1]},
+    achieved={"cup": [1, 2]},
+    fixed=["arm"],
+)
+NESTED = EntityLayout.from_keys(
+    {"arm": ("s", "arm"), "cup": ("s", "cup")}, goal={"cup": "g"}, fixed=["arm"]
+)
+
+
+def flat(rows: int, dtype: torch.dtype = torch.float32, **more: int) -> TensorDict:
+    state = torch.arange(4 * rows).view(rows, 4).to(dtype)
+    td = TensorDict({"observation": state, "next": {"observation": -state}}, [rows])
+    for key, width in more.items():
+        td[key] = torch.zeros(rows, width)
+    return td
+
+
+def nested(rows: int, **more: torch.Tensor) -> TensorDict:
+    cup = {"x": torch.zeros(rows), "pose": {"r": torch.zeros(rows, 2, 2)}, **more}
+    state = {"arm": torch.zeros(rows, 1), "cup": cup}
+    return TensorDict(
+        {"s": state, "next": {"s": state}, "g": torch.zeros(rows)}, [rows]
+    )
+
+
+def test_one_plan_for_each_structure() -> None:
+    planner = SwapPlanner(FLAT)
+    plan = planner(flat(3))[0]
+    assert planner(flat(5))[0] is plan  # whatever the number of rows
+    others = [
+        flat(3, torch.float64),
+        flat(3, desired_goal=2),
+        flat(3, achieved_goal=2),
+        flat(3, unrelated=2),
+    ]
+    plans = [planner(td)[0] for td in others]
+    assert plans[-1] is plan
+    assert len({id(p) for p in [plan, *plans]}) == 4
+    assert pickle.loads(pickle.dumps(planner))(flat(3))[0].states == plan.states
+    planner = SwapPlanner(NESTED)
+    plan = planner(nested(3))[0]
+    assert planner(nested(4))[0] is plan
+    assert planner(nested(3, y=torch.zeros(3)))[0] is not plan
+
+
+def test_leaves_of_a_plan() -> None:
+    plan, values = SwapPlanner(FLAT)(flat(3, desired_goal=2))
+    assert [leaf.key for leaf in plan.leaves] == [
+        "observation",
+        ("next", "observation"),
+        "desired_goal",
+    ]
+    assert [leaf.is_desired for leaf in plan.leaves] == [False, False, True]
+    assert [leaf.group for leaf in plan.leaves] == [0, 0, 1]
+    # One more entity owns what nobody does: column 3.
+    assert plan.leaves[0].owner.tolist() == [0, 1, 1, 2]
+    assert plan.leaves[2].owner.tolist() == [1, 1]
+    assert values[plan.leaves[1].place][1, 1] == -5
+    plan, values = SwapPlanner(NESTED)(nested(3))
+    keys = {leaf.key for leaf in plan.leaves}
+    cup = {("s", "cup", "x"), ("s", "cup", "pose", "r")}
+    assert keys == {"g", *cup, *(("next", *key) for key in cup)}
+    assert {leaf.owner for leaf in plan.leaves} == {1}
+    assert {("s", "arm"), ("next", "s", "arm")} < set(plan.states)
+    for leaf in plan.leaves:
+        assert values[leaf.place].shape == nested(3)[leaf.key].shape
+
+
+def test_integer_states_are_swapped_and_not_checked() -> None:
+    plan, _ = SwapPlanner(FLAT)(flat(3, torch.int64))
+    assert plan.states == () and len(plan.leaves) == 2
+
+
+def test_old_plans_are_dropped() -> None:
+    planner = SwapPlanner(EntityLayout({"arm": [0]}))
+    for width in range(1, 100):
+        state = torch.zeros(2, width)
+        td = TensorDict({"observation": state, "next": {"observation": state}}, [2])
+        plan, _ = planner(td)
+        assert plan.leaves[0].width == width
+    assert len(pickle.dumps(planner)) < 10_000
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_donor_windows_of_a_ring(wraps: bool) -> None:
+    """A donor window that starts at the last row goes on at the first."""
+    td = flat(4)
+    plan, values = SwapPlanner(FLAT)(td)
+    rows = 5  # of 6 in the storage
+    source = 100 + torch.arange(24.0).view(6, 4)
+    draw = SwapDraw(
+        donors=torch.tensor([[0, 4 if wraps else 3]]),
+        swapped=torch.tensor([[False, True]]),
+        no_donor=torch.tensor([0, 0]),
+    )
+    out = apply_swap(
+        td,
+        plan,
+        values,
+        draw,
+        window=2,
+        sources=[source, -source],
+        num_source_rows=rows,
+    )
+    expected = td["observation"].clone()
+    expected[2:, 1:3] = source[[4, 0] if wraps else [3, 4], 1:3]
+    assert torch.equal(out["observation"], expected)
+    assert torch.equal(out["next", "observation"], -expected)
+
+
+def test_places_in_storages_of_more_than_two_billion_values() -> None:
+    """Their places do not fit into 32 bits. The source takes the memory of one row."""
+    td = flat(1)
+    plan, values = SwapPlanner(FLAT)(td)
+    rows = (1 << 31) // 4 + 2
+    one = torch.arange(4.0).view(1, 4)
+    source = one.expand(rows, 4)
+    draw = SwapDraw(
+        donors=torch.tensor([[0, rows - 1]]),
+        swapped=torch.tensor([[False, True]]),
+        no_donor=torch.tensor([0, 0]),
+    )
+    out = apply_swap(td, plan, values, draw, sources=[source, source])
+    assert out["observation"].tolist() == [[0.0, 1.0, 2.0, 3.0]]

@@ -1,0 +1,192 @@
+"""Random draws: which entities are swapped, and which donors they get.
+
+Every function is pure. A *window* is ``window`` consecutive rows of a flat batch, ``B``
+is the number of windows, ``C`` the number of counterfactual windows (the last ones of
+the batch), ``N`` the number of entities.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from torchrl_caiac._random import draw_integers, draw_numbers
+from torchrl_caiac.transforms.indexing import pick_rows, window_max, window_starts
+
+__all__ = [
+    "DonorIndex",
+    "SwapDraw",
+    "draw_batch_donors",
+    "draw_buffer_donors",
+    "uninfluenced",
+]
+
+
+class SwapDraw(NamedTuple):
+    """What was drawn for one batch: who swaps, and with whom.
+
+    Attributes:
+        donors (torch.Tensor): int64 ``[C, N]``, the first row of each entity's donor
+            window, a row of the batch or of the donor storage. Meaningless where
+            nothing is swapped.
+        swapped (torch.Tensor): bool ``[C, N]``.
+        no_donor (torch.Tensor): int64 ``[N]``, the windows whose entity should have
+            been swapped and found no donor.
+        goal_rows (torch.Tensor, optional): int64 ``[C, N]``, the row of the donor
+            storage whose next state is the goal of the donor window.
+    """
+
+    donors: torch.Tensor
+    swapped: torch.Tensor
+    no_donor: torch.Tensor
+    goal_rows: torch.Tensor | None = None
+
+
+class DonorIndex(NamedTuple):
+    """The rows of a storage at which donor windows may start, entity by entity.
+
+    Attributes:
+        starts (torch.Tensor): integer ``[M]``, the rows for the first entity, then
+            for the second, and so on.
+        offset (torch.Tensor): int64 ``[N]``, where an entity's rows begin.
+        size (torch.Tensor): int64 ``[N]``, how many it has.
+    """
+
+    starts: torch.Tensor
+    offset: torch.Tensor
+    size: torch.Tensor
+
+
+def uninfluenced(
+    scores: torch.Tensor, threshold: float, window: int = 1
+) -> torch.Tensor:
+    """The entities that are uninfluenced in all rows of each window (eq. 3.3 and 1).
+
+    Args:
+        scores (torch.Tensor): ``[B * window, N]``; a row that was not scored (NaN) is
+            not uninfluenced.
+        threshold (float): the largest score of an uninfluenced entity, θ.
+        window (int): rows a window. Defaults to 1.
+
+    Returns:
+        torch.Tensor: bool ``[B, N]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.draws import uninfluenced
+        >>> uninfluenced(torch.tensor([[0.0], [0.01], [0.0], [0.2]]), 0.05, window=2)
+        tensor([[ True],
+                [False]])
+    """
+    return window_max(scores, window) <= threshold
+
+
+def _drawn(
+    free: torch.Tensor, swap_prob: float, generator: torch.Generator | None
+) -> torch.Tensor:
+    if swap_prob >= 1.0:
+        return free
+    chance = draw_numbers(
+        torch.rand, free.shape, device=free.device, generator=generator
+    )
+    return free & (chance < swap_prob)
+
+
+def draw_batch_donors(
+    free: torch.Tensor,
+    num_counterfactual: int,
+    *,
+    window: int = 1,
+    swap_prob: float = 1.0,
+    generator: torch.Generator | None = None,
+) -> SwapDraw:
+    """Draws donors among the windows of the batch itself.
+
+    Each entity of each of the last windows draws one of the *other* windows in which
+    it is free too, all with the same probability and independently of the other
+    entities.
+
+    Args:
+        free (torch.Tensor): bool ``[B, N]``, the entities that may be swapped.
+        num_counterfactual (int): how many windows become counterfactual, ``C``.
+
+    Keyword Args:
+        window (int): rows a window. Defaults to 1.
+        swap_prob (float): probability of swapping a free entity. Defaults to 1.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        SwapDraw: the donors as rows of the batch.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.draws import draw_batch_donors
+        >>> free = torch.tensor([[True, False], [False, True], [True, True]])
+        >>> draw = draw_batch_donors(free, 1)
+        >>> draw.donors, draw.swapped
+        (tensor([[0, 1]]), tensor([[True, True]]))
+    """
+    windows, entities = free.shape
+    first = windows - num_counterfactual
+    wanted = _drawn(free[first:], swap_prob, generator).t()
+    free = free.t()
+    # rank[n, b]: how many free windows entity n has up to and including window b.
+    rank = free.cumsum(1)
+    total, own = rank[:, -1:], rank[:, first:]
+    # At least two, of which a remainder can be taken: with fewer there is no donor.
+    size = total.clamp_min(2)
+    pick = draw_integers(own.shape, device=free.device, generator=generator)
+    # Round the circle of free windows from the one behind the own, never back to it.
+    place = (pick % (size - 1) + own) % size
+    # listed[n, r]: the free window of rank r, from 1; those that are not free end up
+    # at 0.
+    starts = window_starts(windows, window, free.device).expand(entities, -1)
+    listed = rank.new_zeros(entities, windows + 2)
+    listed.scatter_(1, rank * free, starts)
+    swapped = wanted & (total > 1)
+    return SwapDraw(
+        listed[:, 1:].gather(1, place).t(), swapped.t(), (wanted ^ swapped).sum(1)
+    )
+
+
+def draw_buffer_donors(
+    free: torch.Tensor,
+    index: DonorIndex,
+    *,
+    swap_prob: float = 1.0,
+    generator: torch.Generator | None = None,
+) -> SwapDraw:
+    """Draws donors among the eligible windows of a donor storage.
+
+    Args:
+        free (torch.Tensor): bool ``[C, N]``, the entities that may be swapped.
+        index (DonorIndex): the eligible windows.
+
+    Keyword Args:
+        swap_prob (float): probability of swapping a free entity. Defaults to 1.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        SwapDraw: the donors as rows of the storage.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.draws import DonorIndex, draw_buffer_donors
+        >>> index = DonorIndex(
+        ...     torch.tensor([7]), torch.tensor([0, 1]), torch.tensor([1, 0])
+        ... )
+        >>> draw_buffer_donors(torch.ones(1, 2, dtype=torch.bool), index).swapped
+        tensor([[ True, False]])
+    """
+    device = free.device
+    wanted = _drawn(free, swap_prob, generator)
+    size = index.size.to(device)
+    pick = draw_integers(free.shape, device=device, generator=generator)
+    pick = (pick % size.clamp_min(1) + index.offset.to(device)).clamp_max_(
+        index.starts.shape[0] - 1
+    )
+    found = size > 0
+    donors = pick_rows(index.starts, pick).to(device, torch.int64)
+    swapped = wanted & found
+    return SwapDraw(donors, swapped, (wanted ^ swapped).sum(0))

@@ -1,0 +1,57 @@
+"""The keys that the transforms share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from tensordict.utils import NestedKey
+
+from torchrl_caiac._keys import as_key
+
+__all__ = ["TransformKeys"]
+
+
+@dataclass(frozen=True)
+class TransformKeys:
+    """The keys, other than those of the layout, that transforms read and write.
+
+    Pass the same object to every transform of a buffer.
+
+    Args:
+        reward (NestedKey): the rewards, ``[*B]`` or ``[*B, 1]``. Defaults to
+            ``("next", "reward")``.
+        trajectory (NestedKey, optional): the trajectory ids, ``[*B]`` or ``[*B, 1]``;
+            ``None`` to tell trajectories apart by end flags alone. Defaults to
+            ``"episode"``.
+        done (NestedKey, optional): the end flags, ``[*B]`` or ``[*B, 1]``; ``None`` to
+            ignore them. Defaults to ``("next", "done")``.
+        counterfactual (NestedKey): the flag of counterfactual transitions, bool
+            ``[*B, 1]``. Defaults to ``("caiac", "counterfactual")``.
+        swapped (NestedKey): the flags of swapped entities, bool ``[*B, N]``. Defaults
+            to ``("caiac", "swapped")``.
+        relabeled (NestedKey): the flag of transitions with another goal, bool
+            ``[*B, 1]``. Defaults to ``("hindsight", "relabeled")``.
+
+    Raises:
+        TypeError: a key is not a ``str`` or a tuple of them.
+
+    Examples:
+        >>> from torchrl_caiac.transforms import TransformKeys
+        >>> keys = TransformKeys(trajectory=("collector", "traj_ids"))
+        >>> keys.reward, keys.trajectory
+        (('next', 'reward'), ('collector', 'traj_ids'))
+    """
+
+    reward: NestedKey = ("next", "reward")
+    trajectory: NestedKey | None = "episode"
+    done: NestedKey | None = ("next", "done")
+    counterfactual: NestedKey = ("caiac", "counterfactual")
+    swapped: NestedKey = ("caiac", "swapped")
+    relabeled: NestedKey = ("hindsight", "relabeled")
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            key = getattr(self, field.name)
+            if key is None and field.name in ("trajectory", "done"):
+                continue
+            object.__setattr__(self, field.name, as_key(key))

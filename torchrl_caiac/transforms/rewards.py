@@ -1,0 +1,181 @@
+"""Rewards from goals: those that are stored, and those that are recomputed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+
+from torchrl_caiac._keys import flatten
+from torchrl_caiac.entities import EntityLayout
+
+__all__ = ["RewardFn", "call_reward", "recompute_reward", "stored_reward"]
+
+#: ``(next_achieved [B, G], desired [B, G])`` to rewards ``[B]`` or ``[B, 1]``.
+RewardFn = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+
+
+def _goal_vectors(
+    td: TensorDictBase, layout: EntityLayout, first: int
+) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """The next achieved and the desired goals of the rows from ``first`` on."""
+    if layout.is_flat:
+        desired = td.get(layout.desired_goal_key, None)
+        achieved = td.get(layout.next(layout.achieved_goal_key), None)
+        if achieved is None and layout.achieved:
+            achieved = layout.achieved_goal(td, next=True)
+        return (
+            None if achieved is None else achieved[first:],
+            None if desired is None else desired[first:],
+        )
+    achieved_parts: list[torch.Tensor] = []
+    desired_parts: list[torch.Tensor] = []
+    for name in layout.names:
+        key = layout.goal.get(name)
+        if key is None:
+            continue
+        for parts, where in (
+            (
+                achieved_parts,
+                layout.achieved.get(name) and layout.next(layout.achieved[name]),
+            ),
+            (desired_parts, key),
+        ):
+            value = None if where is None else td.get(where, None)
+            if value is None:
+                return None, None
+            value = value[first:]
+            if isinstance(value, torch.Tensor):
+                parts.append(value.reshape(len(value), -1))
+            else:
+                parts.append(flatten(value, 1))
+    if not desired_parts:
+        return None, None
+    return torch.cat(achieved_parts, -1), torch.cat(desired_parts, -1)
+
+
+def recompute_reward(
+    td: TensorDictBase,
+    layout: EntityLayout,
+    reward_fn: RewardFn,
+    num_rows: int,
+    *,
+    reward_key: NestedKey = ("next", "reward"),
+) -> torch.Tensor:
+    """Computes the rewards of the last rows from their *next* achieved goals.
+
+    Args:
+        td (TensorDictBase): the batch after swapping, ``[R]``.
+        layout (EntityLayout): the entities. A nested layout's goals are laid side by
+            side, flattened, in layout order.
+        reward_fn (callable): ``(next_achieved [C, G], desired [C, G])`` to rewards
+            ``[C]`` or ``[C, 1]``.
+        num_rows (int): how many rows get a new reward, ``C``.
+
+    Keyword Args:
+        reward_key (NestedKey): the rewards ``[R]`` or ``[R, 1]``.
+
+    Returns:
+        torch.Tensor: all rewards, shape and dtype as before.
+
+    Raises:
+        KeyError: goals or rewards are missing.
+        ValueError: the function returned another number of rewards.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.transforms.rewards import recompute_reward
+        >>> layout = EntityLayout(
+        ...     {"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]}
+        ... )
+        >>> td = TensorDict(
+        ...     {
+        ...         "desired_goal": torch.ones(2, 1),
+        ...         "next": {
+        ...             "observation": torch.tensor([[0.0], [3.0]]),
+        ...             "reward": torch.zeros(2, 1),
+        ...         },
+        ...     },
+        ...     [2],
+        ... )
+        >>> recompute_reward(td, layout, lambda a, d: -(a - d).norm(dim=-1), 1)
+        tensor([[ 0.],
+                [-2.]])
+    """
+    reward = stored_reward(td, reward_key)
+    first = reward.shape[0] - num_rows
+    achieved, desired = _goal_vectors(td, layout, first)
+    if achieved is None or desired is None:
+        what = "next achieved goals" if achieved is None else "desired goals"
+        raise KeyError(
+            f"reward_fn is given, but the batch has no {what}: the layout looks under "
+            f"{layout.desired_goal_key!r} and {layout.achieved_goal_key!r} (or its "
+            "`goal` and `achieved` keys)"
+        )
+    new = call_reward(reward_fn, achieved, desired, reward[first:])
+    return torch.cat([reward[:first], new])
+
+
+def stored_reward(td: TensorDictBase, reward_key: NestedKey) -> torch.Tensor:
+    """The rewards of a batch.
+
+    Args:
+        td (TensorDictBase): the batch ``[B]``.
+        reward_key (NestedKey): the rewards.
+
+    Returns:
+        torch.Tensor: ``[B]`` or ``[B, 1]``.
+
+    Raises:
+        KeyError: there are none.
+        ValueError: there is not one for each row.
+    """
+    reward = td.get(reward_key, None)
+    if reward is None:
+        raise KeyError(
+            f"reward_fn is given, but the batch has no {reward_key!r}: name the "
+            "rewards by keys=TransformKeys(reward=...)"
+        )
+    if reward.numel() != td.shape[0]:
+        raise ValueError(
+            f"{reward_key!r} has shape {list(reward.shape)}, expected "
+            f"[{td.shape[0]}, 1]: one reward for each row"
+        )
+    return reward
+
+
+def call_reward(
+    reward_fn: RewardFn,
+    achieved: torch.Tensor,
+    desired: torch.Tensor,
+    like: torch.Tensor,
+) -> torch.Tensor:
+    """Calls a reward function, and gives its rewards the shape of stored ones.
+
+    Args:
+        reward_fn (callable): ``(next_achieved [B, G], desired [B, G])`` to rewards
+            ``[B]`` or ``[B, 1]``.
+        achieved (torch.Tensor): ``[B, G]``, the next achieved goals.
+        desired (torch.Tensor): ``[B, G]``.
+        like (torch.Tensor): rewards ``[B]`` or ``[B, 1]``.
+
+    Returns:
+        torch.Tensor: the rewards, shape, dtype and device of ``like``.
+
+    Raises:
+        ValueError: the function returned another number of rewards.
+    """
+    new = reward_fn(achieved, desired)
+    rows = achieved.shape[0]
+    shape = tuple(new.shape) if isinstance(new, torch.Tensor) else None
+    if shape not in ((rows,), (rows, 1)):
+        found = type(new).__name__ if shape is None else list(shape)
+        raise ValueError(
+            f"reward_fn returned {found} for goals {list(achieved.shape)}, expected "
+            f"[{rows}] or [{rows}, 1]"
+        )
+    return new.reshape(like.shape).to(like)

@@ -1,0 +1,425 @@
+"""Swapping entities between windows: the inner loop of Algorithm 1.
+
+What depends on the layout and on the structure of a batch alone (its leaves, the owner
+of every column, how columns are laid out) is resolved once, into a :class:`SwapPlan`.
+Notation as in :mod:`torchrl_caiac.transforms.draws`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDictBase, is_leaf_nontensor
+from tensordict.utils import NestedKey
+
+from torchrl_caiac._keys import join
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms.draws import SwapDraw
+from torchrl_caiac.transforms.indexing import pick_places, window_starts
+
+__all__ = ["SwapLeaf", "SwapPlan", "SwapPlanner", "apply_swap"]
+
+_MAX_PLANS = 16  # structures of batches that a planner remembers
+
+
+class SwapLeaf(NamedTuple):
+    """A leaf that follows a swap.
+
+    Attributes:
+        key (NestedKey): where it is.
+        place (int): its place among the leaves that the planner reads.
+        owner (int or torch.Tensor): the one entity that it belongs to, or the entity
+            of each of its columns, int64 ``[D]``, ``N`` where no entity owns it.
+        width (int): its columns ``D``; 1 where it belongs to one entity.
+        group (int): leaves of the same owner and width share their index.
+        is_desired (bool): whether it is a desired goal.
+    """
+
+    key: NestedKey
+    place: int
+    owner: int | torch.Tensor
+    width: int
+    group: int
+    is_desired: bool
+
+
+class SwapPlan(NamedTuple):
+    """What swapping in batches of one structure needs, resolved once.
+
+    Attributes:
+        leaves (tuple of SwapLeaf): what follows a swap.
+        states (tuple of NestedKey): the floating-point leaves of states and next
+            states, those of fixed entities included.
+    """
+
+    leaves: tuple[SwapLeaf, ...]
+    states: tuple[NestedKey, ...]
+
+
+class _Source(NamedTuple):
+    """A key of the layout that a swap concerns, if the batch has it."""
+
+    key: NestedKey
+    kind: str  # "state" or "goal", of a flat layout
+    entity: int
+    is_required: bool
+    is_desired: bool
+    is_swapped: bool
+
+
+class SwapPlanner:
+    """Reads the leaves of batches, and makes the plan of each structure once.
+
+    Args:
+        layout (EntityLayout): the entities.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.transforms.swap import SwapPlanner
+        >>> planner = SwapPlanner(EntityLayout({"arm": [0], "cup": [1]}))
+        >>> state = torch.zeros(4, 2)
+        >>> td = TensorDict({"observation": state, ("next", "observation"): state}, [4])
+        >>> plan, values = planner(td)
+        >>> plan.states, plan.leaves[0].owner
+        (('observation', ('next', 'observation')), tensor([0, 1]))
+        >>> planner(td)[0] is plan
+        True
+    """
+
+    def __init__(self, layout: EntityLayout) -> None:
+        self.layout = layout
+        self._sources = _flat_sources(layout) if layout.is_flat else _sources(layout)
+        self._plans: dict[Hashable, SwapPlan] = {}
+
+    @property
+    def keys(self) -> list[NestedKey]:
+        """The keys that a swap reads and writes, as far as a batch has them."""
+        has_goals = bool(self.layout.goal)
+        return [s.key for s in self._sources if s.is_required or has_goals]
+
+    def __call__(self, td: TensorDictBase) -> tuple[SwapPlan, list[torch.Tensor]]:
+        """Reads a batch.
+
+        Args:
+            td (TensorDictBase): the batch ``[B * window]``.
+
+        Returns:
+            tuple: the plan, and the leaves that :attr:`SwapLeaf.place` counts.
+
+        Raises:
+            KeyError: a leaf is missing.
+            ValueError: a leaf has the wrong width.
+            TypeError: an entity contains something other than tensors.
+        """
+        found: list[Any] = [td.get(source.key, None) for source in self._sources]
+        if self.layout.is_flat:
+            signature: Hashable = tuple(map(_signature, found))
+        else:
+            found, signature = _expanded(self._sources, found)
+        plan = self._plans.get(signature)
+        if plan is None:
+            if len(self._plans) >= _MAX_PLANS:
+                self._plans.clear()
+            make = self._flat_plan if self.layout.is_flat else self._plan
+            plan = self._plans[signature] = make(td, found)
+        return plan, found
+
+    def _flat_plan(self, td: TensorDictBase, found: list[Any]) -> SwapPlan:
+        layout = self.layout
+        leaves: list[SwapLeaf] = []
+        owners: dict[Hashable, tuple[int, torch.Tensor]] = {}
+        for place, (source, value) in enumerate(zip(self._sources, found, strict=True)):
+            if source.is_required and not isinstance(value, torch.Tensor):
+                layout.check(td, next=True)  # raises
+            if value is None:
+                continue
+            if source.kind == "state":
+                if value.ndim != 2:
+                    raise ValueError(
+                        f"{source.key!r} has shape {list(value.shape)}, expected "
+                        f"[{td.shape[0]}, D]: the columns of a flat layout are those "
+                        "of a vector"
+                    )
+            elif not layout.goal:
+                if source.is_desired:
+                    continue
+                raise ValueError(
+                    f"the batch has {source.key!r}, which must follow the swapped "
+                    "entities, but the layout does not say which entity each column "
+                    "belongs to: give EntityLayout(..., goal=..., achieved=...)"
+                )
+            elif value.ndim != 2 or value.shape[-1] != layout.goal_width:
+                raise ValueError(
+                    f"{source.key!r} has shape {list(value.shape)}, but the layout's "
+                    f"goal has {layout.goal_width} columns: correct `goal`, or the data"
+                )
+            width = value.shape[-1]
+            kind = (source.kind, width, value.device)
+            if kind not in owners:
+                owner = (
+                    layout.column_entity(width)
+                    if source.kind == "state"
+                    else layout.goal_column_entity()
+                )
+                owner = torch.where(owner < 0, len(layout), owner)
+                owners[kind] = len(owners), owner.to(value.device)
+            group, owner = owners[kind]
+            leaves.append(
+                SwapLeaf(source.key, place, owner, width, group, source.is_desired)
+            )
+        states = [
+            source.key
+            for source, value in zip(self._sources, found, strict=True)
+            if source.kind == "state" and value.is_floating_point()
+        ]
+        return SwapPlan(tuple(leaves), tuple(states))
+
+    def _plan(self, td: TensorDictBase, found: list[Any]) -> SwapPlan:
+        keys, owners = _expanded_keys(self._sources, td)
+        if any(o.is_required and td.get(o.key, None) is None for o in self._sources):
+            self.layout.check(td, next=True)
+        leaves, states = [], []
+        for place, (key, source, value) in enumerate(
+            zip(keys, owners, found, strict=True)
+        ):
+            if not isinstance(value, torch.Tensor):
+                raise TypeError(
+                    f"{key!r} is a {type(value).__name__}, but an entity is made of "
+                    "tensors: leave it out of the entity's sub-tensordict"
+                )
+            if source.is_swapped:
+                entity = source.entity
+                leaves.append(
+                    SwapLeaf(key, place, entity, 1, entity, source.is_desired)
+                )
+            if source.is_required and value.is_floating_point():
+                states.append(key)
+        return SwapPlan(tuple(leaves), tuple(states))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_plans": {}}
+
+
+def _flat_sources(layout: EntityLayout) -> list[_Source]:
+    state, achieved, desired = (
+        layout.observation_key,
+        layout.achieved_goal_key,
+        layout.desired_goal_key,
+    )
+    found = []
+    for key, kind, is_desired in (
+        (state, "state", False),
+        (achieved, "goal", False),
+        (desired, "goal", True),
+    ):
+        for where in (key, layout.next(key)):
+            is_required = kind == "state"
+            found.append(_Source(where, kind, -1, is_required, is_desired, True))
+    return found
+
+
+def _sources(layout: EntityLayout) -> list[_Source]:
+    found = []
+    for entity, name in enumerate(layout.names):
+        is_swapped = name not in layout.fixed
+        keys = [(layout.keys[name], True, False)]
+        if is_swapped:
+            keys += [
+                (layout.achieved.get(name), False, False),
+                (layout.goal.get(name), False, True),
+            ]
+        for key, is_required, is_desired in keys:
+            if key is None:
+                continue
+            for where in (key, layout.next(key)):
+                found.append(
+                    _Source(where, "", entity, is_required, is_desired, is_swapped)
+                )
+    return found
+
+
+def _signature(value: Any) -> Hashable:
+    if isinstance(value, torch.Tensor):
+        return value.shape[1:], value.dtype, value.device
+    return str(type(value))
+
+
+def _expanded(
+    sources: Sequence[_Source], found: list[Any]
+) -> tuple[list[Any], Hashable]:
+    """The leaves below what a nested layout names, and what plans depend on."""
+    values: list[Any] = []
+    signature: list[Hashable] = []
+    for value in found:
+        if isinstance(value, TensorDictBase):
+            items = list(value.items(True, True, is_leaf=is_leaf_nontensor))
+            values += [leaf for _, leaf in items]
+            signature.append(tuple((k, _signature(leaf)) for k, leaf in items))
+        else:
+            if value is not None:
+                values.append(value)
+            signature.append(_signature(value))
+    return values, tuple(signature)
+
+
+def _expanded_keys(
+    sources: Sequence[_Source], td: TensorDictBase
+) -> tuple[list[NestedKey], list[_Source]]:
+    """The keys of the leaves of :func:`_expanded`, and whose they are."""
+    keys: list[NestedKey] = []
+    owners: list[_Source] = []
+    for source in sources:
+        value = td.get(source.key, None)
+        if isinstance(value, TensorDictBase):
+            for below in value.keys(True, True, is_leaf=is_leaf_nontensor):
+                keys.append(join(source.key, below))
+                owners.append(source)
+        elif value is not None:
+            keys.append(source.key)
+            owners.append(source)
+    return keys, owners
+
+
+# --- applying ------------------------------------------------------------------------
+
+
+def apply_swap(
+    td: TensorDictBase,
+    plan: SwapPlan,
+    values: Sequence[torch.Tensor],
+    draw: SwapDraw,
+    *,
+    window: int = 1,
+    sources: Sequence[torch.Tensor] | None = None,
+    num_source_rows: int | None = None,
+    goals: Callable[[SwapLeaf], torch.Tensor] | None = None,
+) -> TensorDictBase:
+    """Replaces entities by those of their donors.
+
+    The states, next states, achieved goals and desired goals of the last ``C`` windows
+    follow the swap. Everything else, and all other windows, stay.
+
+    Args:
+        td (TensorDictBase): the batch, ``[B * window]``. It is not changed.
+        plan (SwapPlan): its plan.
+        values (sequence of torch.Tensor): its leaves, both of :class:`SwapPlanner`.
+        draw (SwapDraw): what was drawn.
+
+    Keyword Args:
+        window (int): rows in a window. Defaults to 1.
+        sources (sequence of torch.Tensor, optional): for each leaf of the plan what
+            ``draw.donors`` are rows of, ``[T, ...]``; by default the batch itself.
+        num_source_rows (int, optional): rows in use in ``sources``, after which
+            windows continue at row 0 (in a full ring).
+        goals (callable, optional): reads the desired goals ``[C, ...]`` of a leaf from
+            elsewhere.
+
+    Returns:
+        TensorDictBase: a shallow copy with new leaves.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.transforms.draws import SwapDraw
+        >>> from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
+        >>> state = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
+        >>> td = TensorDict(
+        ...     {"observation": state, ("next", "observation"): state + 10}, [2]
+        ... )
+        >>> draw = SwapDraw(
+        ...     donors=torch.tensor([[0, 0]]),
+        ...     swapped=torch.tensor([[False, True]]),
+        ...     no_donor=torch.tensor([0, 0]),
+        ... )
+        >>> planner = SwapPlanner(EntityLayout({"arm": [0], "cup": [1]}))
+        >>> out = apply_swap(td, *planner(td), draw)
+        >>> out["observation"], out["next", "observation"]
+        (tensor([[0., 1.],
+                [2., 1.]]), tensor([[10., 11.],
+                [12., 11.]]))
+    """
+    out = td.copy()
+    changed = draw.swapped.shape[0]
+    if not changed:
+        return out
+    first = td.shape[0] - changed * window
+    if sources is None:
+        starts = window_starts(len(td) // window, window, draw.swapped.device)
+        own = starts[-changed:].unsqueeze(-1)
+    else:
+        own = draw.donors.new_zeros(changed, 1)
+    # Where nothing is swapped, a row of the batch is its own donor; one more entity,
+    # which is never swapped, owns the columns that no entity owns.
+    rows = torch.cat([torch.where(draw.swapped, draw.donors, own), own], -1)
+    places: dict[int, torch.Tensor] = {}
+    masks: dict[tuple[int, int], torch.Tensor] = {}
+    for number, leaf in enumerate(plan.leaves):
+        value = values[leaf.place]
+        if goals is not None and leaf.is_desired:
+            new = goals(leaf).unsqueeze(1)
+        else:
+            source = value if sources is None else sources[number]
+            if leaf.group not in places:
+                found = _places(rows, leaf, window, len(source), num_source_rows)
+                places[leaf.group] = found.to(source.device)
+            new = _read(source, places[leaf.group], leaf)
+        if sources is not None:
+            kind = leaf.group, value.ndim
+            if kind not in masks:
+                masks[kind] = _mask(draw.swapped, leaf, value.ndim)
+            tail = value[first:].unflatten(0, (changed, window))
+            new = new.to(tail.device).view(changed, -1, *tail.shape[2:])
+            new = torch.where(masks[kind], new, tail).flatten(0, 1)
+        out.set(leaf.key, torch.cat([value[:first], new]))
+    return out
+
+
+@lru_cache(maxsize=64)
+def _inside(
+    window: int, width: int, device: torch.device, dtype: torch.dtype
+) -> torch.Tensor:
+    """The places of a window's values from its first one, ``[window, width]``."""
+    places = torch.arange(window * width, device=device, dtype=dtype)
+    return places.view(window, width)
+
+
+def _places(
+    rows: torch.Tensor, leaf: SwapLeaf, window: int, length: int, num_rows: int | None
+) -> torch.Tensor:
+    """Where the values of each donor window are in a source of ``length`` rows.
+
+    Returns rows ``[C * window]`` for one entity's leaf; for columns, places
+    ``[C * window * D]`` in the source as one vector.
+    """
+    if isinstance(leaf.owner, int):
+        place = rows[:, leaf.owner : leaf.owner + 1]
+    else:
+        owner = leaf.owner.to(rows.device)
+        place = rows.gather(1, owner.expand(rows.shape[0], -1))
+    if length * leaf.width < 1 << 31:  # half as much to write and to read
+        place = place.int()
+    inside = _inside(window, leaf.width, rows.device, place.dtype)
+    place = torch.add(inside, place.unsqueeze(1), alpha=leaf.width).flatten()
+    return place if num_rows is None else place % (num_rows * leaf.width)
+
+
+def _mask(swapped: torch.Tensor, leaf: SwapLeaf, ndim: int) -> torch.Tensor:
+    """Which values of a leaf are swapped, to broadcast with ``[C, window, ...]``."""
+    if isinstance(leaf.owner, int):
+        return swapped[:, leaf.owner].view(-1, *(1,) * ndim)
+    owner = leaf.owner.to(swapped.device).expand(swapped.shape[0], -1)
+    return F.pad(swapped, (0, 1)).gather(1, owner).unsqueeze(1)
+
+
+def _read(source: torch.Tensor, places: torch.Tensor, leaf: SwapLeaf) -> torch.Tensor:
+    """Reads the values of donor windows, ``[C * window, ...]``."""
+    if isinstance(leaf.owner, int):
+        return source.index_select(0, places)
+    return pick_places(source, places).view(-1, leaf.width)
