@@ -148,7 +148,7 @@ def test_cached_in_a_storage_for_coda_and_coda_action(
     score_buffer(rb, graphs, **ahead)
     last = torch.arange(9, 60, 10)
     torch.testing.assert_close(rb.storage[:]["coda", "ahead"][last], stored[last])
-    with pytest.raises(ValueError, match="made with other settings: estimator"):
+    with pytest.raises(ValueError, match="have other settings: estimator"):
         score_buffer(rb, action, key=("coda", "graph"), **options)
     threshold = stored[:, -1].median().item()
     rb.append_transform(

@@ -5,13 +5,15 @@ from __future__ import annotations
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI, causal_action_influence
 from torchrl_caiac.influence.distance import DistanceInfluence
+from torchrl_caiac.influence.mark_unscored import MarkUnscored, set_unscored
 from torchrl_caiac.influence.metrics import (
     EntityReport,
     best_threshold,
     influence_report,
     roc_auc,
 )
-from torchrl_caiac.influence.score_buffer import MarkUnscored, score_buffer
+from torchrl_caiac.influence.score_buffer import score_buffer
+from torchrl_caiac.influence.score_record import score_file
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,
     TrueInfluence,
@@ -33,5 +35,7 @@ __all__ = [
     "oracle_score",
     "roc_auc",
     "score_buffer",
+    "score_file",
+    "set_unscored",
     "true_influence",
 ]

@@ -1,0 +1,108 @@
+"""The leaf that holds the scores."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import (
+    ImmutableDatasetWriter,
+    ReplayBuffer,
+    TensorStorage,
+)
+
+from tests.influence.scoring import (
+    KEY,
+    Read,
+    definition,
+    episodes,
+    filled,
+    scores,
+    square,
+)
+from torchrl_caiac.influence import (
+    score_buffer,
+    score_file,
+)
+
+
+def test_a_loaded_folder_stays_memory_mapped(tmp_path):
+    rows = episodes([5, 7])
+    rows.memmap(tmp_path / "data")
+    rb = ReplayBuffer(
+        storage=TensorStorage(TensorDict.load_memmap(tmp_path / "data")),
+        writer=ImmutableDatasetWriter(),
+        batch_size=4,
+    )
+    score_buffer(rb, Read(), progress=False)
+    again = TensorDict.load_memmap(tmp_path / "data")
+    torch.testing.assert_close(again[KEY], definition(rows, square, 1, 1))
+    assert torch.equal(again["observation"], rows["observation"])
+    assert score_file(tmp_path / "data").exists()
+    # As in another process: nothing is left to do.
+    estimator = Read()
+    score_buffer(ReplayBuffer(storage=TensorStorage(again)), estimator, progress=False)
+    assert estimator.rows == []
+
+
+def test_two_leaves_with_different_settings(tmp_path):
+    rb = filled(episodes([5, 7]), "memmap", tmp_path=tmp_path)
+    score_buffer(rb, Read(), progress=False)
+    score_buffer(rb, Read(2.0), key="other", progress=False)
+    torch.testing.assert_close(scores(rb, "other"), 4 * scores(rb))
+    rb.extend(episodes([12], first_id=50))
+    assert scores(rb).isnan().all()
+    assert scores(rb, "other").isnan().all()
+
+
+@pytest.mark.parametrize("kind", ["memory", "memmap"])
+@pytest.mark.parametrize(
+    "leaf",
+    [
+        torch.zeros(12, 4),
+        torch.zeros(12, 3, dtype=torch.float64),
+        torch.zeros(12, 3, dtype=torch.int64),
+        torch.zeros(12),
+    ],
+)
+def test_a_leaf_of_another_origin_is_replaced_only_on_request(kind, leaf, tmp_path):
+    rows = episodes([5, 7]).set(KEY, leaf)
+    rb = filled(rows, kind, tmp_path=tmp_path)
+    with pytest.raises(ValueError, match="overwrite=True"):
+        score_buffer(rb, Read(), progress=False)
+    assert torch.equal(scores(rb), leaf)
+    score_buffer(rb, Read(), overwrite=True, progress=False)
+    torch.testing.assert_close(scores(rb), definition(rows, square, 1, 1))
+    assert rb.storage._storage.is_memmap() == (kind == "memmap")
+    if kind == "memmap":
+        again = TensorDict.load_memmap(tmp_path / "data")
+        assert torch.equal(again[KEY], scores(rb))
+    rb.extend(rows)
+    assert scores(rb).isnan().all()
+
+
+def test_nothing_is_written_if_the_estimator_does_not_fit(tmp_path):
+    rb = filled(episodes([5, 7]), "memmap", tmp_path=tmp_path)
+    files = sorted(p.name for p in (tmp_path / "data").rglob("*"))
+
+    class Wide(Read):
+        def forward(self, td):
+            return torch.zeros(len(td), 5)
+
+    class Short(Read):
+        def forward(self, td):
+            return torch.zeros(len(td) - 1, 3)
+
+    class Whole(Read):
+        def forward(self, td):
+            return torch.zeros(len(td), 3, dtype=torch.long)
+
+    for bad, match in (
+        (Wide(), r"shape \[12, 5\] for 12 states, expected \[12, 3\]"),
+        (Short(), r"shape \[11, 3\]"),
+        (Whole(), "floating-point"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            score_buffer(rb, bad, progress=False)
+    assert sorted(p.name for p in (tmp_path / "data").rglob("*")) == files
+    assert KEY not in rb.storage[:].keys(include_nested=True)

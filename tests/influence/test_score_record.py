@@ -1,0 +1,126 @@
+"""The record of how scores were computed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+)
+
+from tests.influence.scoring import (
+    KEY,
+    Read,
+    definition,
+    episodes,
+    filled,
+    scores,
+    square,
+)
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.influence import (
+    CAI,
+    score_buffer,
+    score_file,
+)
+from torchrl_caiac.modules import GaussianWorldModel
+
+
+@pytest.mark.parametrize("kind", ["memory", "memmap"])
+def test_dumps_and_loads_keep_the_scores_without_the_record(kind, tmp_path):
+    rb = filled(episodes([5, 7]), kind, 20, tmp_path)
+    score_buffer(rb, Read(), progress=False)
+    rb.dumps(tmp_path / "saved")
+    for other in (LazyTensorStorage(20), LazyMemmapStorage(20)):
+        loaded = ReplayBuffer(storage=other, batch_size=4)
+        loaded.loads(tmp_path / "saved")
+        assert torch.equal(scores(loaded), scores(rb))
+        assert not loaded.sample()[KEY].isnan().any()
+        with pytest.raises(ValueError, match="without a record"):
+            score_buffer(loaded, Read(), progress=False)
+        score_buffer(loaded, Read(), overwrite=True, progress=False)
+        assert torch.equal(scores(loaded), scores(rb))
+
+
+def test_interrupted_before_the_leaf_was_initialized(tmp_path):
+    # Then the leaf on disk is all zeros, and the state in the record is "new".
+    rows = episodes([5, 7])
+    rb = filled(rows, "memmap", tmp_path=tmp_path)
+    score_buffer(rb, Read(), progress=False)
+    record = json.loads(score_file(tmp_path / "data").read_text())
+    score_file(tmp_path / "data").write_text(json.dumps({**record, "state": "new"}))
+    rb.storage._storage[KEY].zero_()
+    score_buffer(rb, Read(), progress=False)
+    torch.testing.assert_close(scores(rb), definition(rows, square, 1, 1))
+
+
+@pytest.mark.parametrize("kind", ["memory", "memmap", "memmap without a folder"])
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"estimator": Read(2.0)}, "estimator was"),
+        ({"smoothing": 3}, "smoothing was 1, is 3"),
+        ({"lookahead": 0}, "lookahead was 1, is 0"),
+        ({"done_key": None}, "done_key was"),
+    ],
+)
+def test_scores_with_other_settings_are_never_mixed(kind, change, named, tmp_path):
+    rows = episodes([5, 7])
+    rb = filled(rows, kind, tmp_path=tmp_path)
+    score_buffer(rb, Read(), progress=False)
+    before = scores(rb)
+    kwargs = {"estimator": Read(), "progress": False, **change}
+    with pytest.raises(ValueError, match=named):
+        score_buffer(rb, **kwargs)
+    assert torch.equal(scores(rb), before)
+    score_buffer(rb, overwrite=True, **kwargs)
+    score_buffer(rb, **kwargs)
+    expected = filled(rows)
+    score_buffer(expected, **kwargs)
+    assert torch.equal(scores(rb), scores(expected))
+
+
+def test_modes_of_cai_are_never_mixed():
+    layout = EntityLayout({"arm": [0], "cup": [1, 2]})
+    model = GaussianWorldModel(layout, 2, (8,))
+    rb = filled(episodes([20, 20]))
+    fast = {"mode": "fast", "threshold": 1e-4}
+    score_buffer(rb, CAI(model, **fast), progress=False)
+    score_buffer(rb, CAI(model, compile=False, **fast), progress=False)
+    for other in (CAI(model), CAI(model, mode="fast", threshold=1e-3)):
+        with pytest.raises(ValueError, match="have other settings: estimator"):
+            score_buffer(rb, other, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ('{"format": "torchrl_cai', "truncated or damaged"),
+        ("", "truncated or damaged"),
+        ('{"something": 1}', "no score file"),
+        ("[1]", "no score file"),
+        ('{"format": "torchrl_caiac.scores", "version": 99}', "version 99"),
+        ('{"format": "torchrl_caiac.scores", "version": 1}', "incomplete"),
+    ],
+)
+def test_rejects_a_bad_score_file(text, match, tmp_path):
+    rows = episodes([5, 7])
+    rb = filled(rows, "memmap", tmp_path=tmp_path)
+    score_buffer(rb, Read(), progress=False)
+    before = scores(rb)
+    score_file(tmp_path / "data").write_text(text)
+    with pytest.raises(ValueError, match=match) as error:
+        score_buffer(rb, Read(), progress=False)
+    assert "overwrite=True" in str(error.value)
+    assert torch.equal(scores(rb), before)
+    score_buffer(rb, Read(), overwrite=True, progress=False)
+    assert torch.equal(scores(rb), before)
+
+
+def test_the_score_file_is_named_after_the_key():
+    assert score_file("x", ("coda", "graph")) == Path("x/coda.graph.json")

@@ -1,0 +1,205 @@
+"""The record of how scores were computed, which is kept next to them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import TensorStorage
+
+from torchrl_caiac._files import write_json
+from torchrl_caiac._keys import jsonable, path
+from torchrl_caiac._torchrl import memmap_folder
+from torchrl_caiac.entities import EntityLayout
+
+__all__ = [
+    "estimator_digest",
+    "layout_digest",
+    "read_record",
+    "score_file",
+    "settings_that_differ",
+    "write_record",
+]
+
+_FORMAT = "torchrl_caiac.scores"
+_VERSION = 1
+
+
+def score_file(folder: str | Path, key: NestedKey = ("caiac", "score")) -> Path:
+    """Returns the path of the file that records how scores were computed.
+
+    Args:
+        folder (str or Path): the folder of the memory-mapped tensordict.
+        key (NestedKey): the score leaf. Defaults to ``("caiac", "score")``.
+
+    Returns:
+        Path: the file, whether it exists or not.
+
+    Examples:
+        >>> from torchrl_caiac.influence.score_record import score_file
+        >>> score_file("data").name
+        'caiac.score.json'
+    """
+    return Path(folder) / f"{'.'.join(path(key))}.json"
+
+
+def read_record(
+    storage: TensorStorage, data: TensorDictBase, key: NestedKey
+) -> dict[str, Any] | None:
+    """Returns the record of some scores.
+
+    Args:
+        storage (TensorStorage): the storage; has the record of data without a folder.
+        data (TensorDictBase): its rows.
+        key (NestedKey): the score leaf.
+
+    Returns:
+        dict, optional: ``"state"`` (``"new"`` until the leaf is initialized, then
+        ``"scored"``), ``"settings"`` and others; ``None`` where there is no record.
+
+    Raises:
+        ValueError: the file is damaged, or is no score file of this version.
+    """
+    folder = _folder(data)
+    if folder is None:
+        return getattr(storage, "caiac_scores", {}).get(key)
+    file = score_file(folder, key)
+    if not file.exists():
+        return None
+    remedy = (
+        "call score_buffer(..., overwrite=True) to recompute the scores, or delete the "
+        "file together with the scores"
+    )
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(
+            f"the score file {file} is truncated or damaged ({error}): {remedy}"
+        ) from error
+    if not isinstance(record, dict) or record.get("format") != _FORMAT:
+        raise ValueError(f"{file} is no score file of torchrl_caiac: {remedy}")
+    if record.get("version") != _VERSION:
+        raise ValueError(
+            f"the score file {file} has version {record.get('version')!r}, this "
+            f"package reads {_VERSION}: update torchrl_caiac, or {remedy}"
+        )
+    if record.get("state") not in ("new", "scored") or not isinstance(
+        record.get("settings"), dict
+    ):
+        raise ValueError(f"the score file {file} is incomplete: {remedy}")
+    return record
+
+
+def write_record(
+    storage: TensorStorage,
+    data: TensorDictBase,
+    key: NestedKey,
+    settings: dict[str, Any],
+    layout: EntityLayout,
+    state: str,
+) -> None:
+    """Writes the record of some scores, which :func:`read_record` returns.
+
+    Args:
+        storage (TensorStorage): the storage.
+        data (TensorDictBase): its rows.
+        key (NestedKey): the score leaf.
+        settings (dict): what the scores depend on.
+        layout (EntityLayout): the entities.
+        state (str): ``"new"`` or ``"scored"``.
+    """
+    record = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "state": state,
+        "key": jsonable(key),
+        "entities": list(layout.names),
+        "fingerprint": _sha(json.dumps(settings, sort_keys=True)),
+        "settings": settings,
+    }
+    folder = _folder(data)
+    if folder is None:
+        records = getattr(storage, "caiac_scores", {})
+        storage.caiac_scores = {**records, key: record}
+    else:
+        write_json(score_file(folder, key), record)
+
+
+def settings_that_differ(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Returns the differences between two settings, for an error message.
+
+    Args:
+        before (dict): the settings of the record.
+        now (dict): the settings of this call.
+
+    Returns:
+        str: such as ``"smoothing was 1, is 3"``.
+
+    Examples:
+        >>> from torchrl_caiac.influence.score_record import settings_that_differ
+        >>> settings_that_differ({"smoothing": 1}, {"smoothing": 3})
+        'smoothing was 1, is 3'
+    """
+    return ", ".join(
+        f"{name} was {_short(before.get(name))}, is {_short(now.get(name))}"
+        for name in {**before, **now}
+        if before.get(name) != now.get(name)
+    )
+
+
+def layout_digest(layout: EntityLayout) -> str:
+    """Returns a digest of a layout.
+
+    Args:
+        layout (EntityLayout): the layout.
+
+    Returns:
+        str: hexadecimal SHA-256.
+    """
+    return _sha(json.dumps(layout.to_dict(), sort_keys=True))
+
+
+def estimator_digest(estimator: Any) -> str:
+    """Returns a digest of what an estimator computes.
+
+    Args:
+        estimator (callable): its type, ``repr`` and ``state_dict`` enter the digest.
+
+    Returns:
+        str: hexadecimal SHA-256.
+    """
+    digest = hashlib.sha256()
+    kind = estimator if hasattr(estimator, "__qualname__") else type(estimator)
+    digest.update(f"{kind.__module__}.{kind.__qualname__}".encode())
+    # The repr has the settings that are no tensors. Addresses differ between processes.
+    digest.update(re.sub(r" at 0x[0-9a-fA-F]+", "", repr(estimator)).encode())
+    state = estimator.state_dict() if hasattr(estimator, "state_dict") else {}
+    for name in sorted(state):
+        value = state[name]
+        digest.update(name.encode())
+        if isinstance(value, torch.Tensor):
+            digest.update(f"{value.dtype}{list(value.shape)}".encode())
+            flat = value.detach().cpu().contiguous().reshape(-1)
+            digest.update(flat.view(torch.uint8).numpy().tobytes())
+        else:
+            digest.update(repr(value).encode())
+    return digest.hexdigest()
+
+
+def _folder(data: TensorDictBase) -> str | None:
+    return memmap_folder(data) if data.is_memmap() else None
+
+
+def _sha(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else repr(value)
+    return f"{text[:8]}..." if len(text) == 64 else text

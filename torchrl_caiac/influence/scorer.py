@@ -1,0 +1,312 @@
+"""Computes the scores of a storage, chunk by chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_caiac._keys import as_key, missing_key
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
+from torchrl_caiac.trajectories import TrajectoryIndex
+
+__all__ = ["Scorer"]
+
+_NAMED = 8  # rows that an error names
+_SAMPLE = 4096  # states that an estimator may look at before it scores
+
+# Scores of the states of a block's rows, of the states after them, and which rows are
+# the last of their trajectories.
+_Block = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+class Scorer:
+    """Computes the scores of one chunk of rows after another.
+
+    The estimator is called on blocks of ``batch_size`` rows that start at multiples of
+    ``batch_size``. So the raw score of a state does not depend on where an interrupted
+    call resumed. A chunk is the rows of a block; it reads the blocks that its windows
+    reach.
+
+    Args:
+        data (TensorDictBase): the rows of the storage, ``[capacity]``.
+        estimator (callable): see :func:`~torchrl_caiac.influence.score_buffer`.
+        layout (EntityLayout): the entities.
+        index (TrajectoryIndex): the trajectories of the rows.
+
+    Keyword Args:
+        batch_size (int): rows in a block.
+        smoothing (int): see :func:`~torchrl_caiac.influence.score_buffer`.
+        lookahead (int): the same.
+        every (int): the same.
+
+    Attributes:
+        num_chunks: the number of chunks.
+        feature_shape: the shape of the scores of a row, ``None`` until it is known.
+    """
+
+    def __init__(
+        self,
+        data: TensorDictBase,
+        estimator: Callable[[TensorDictBase], torch.Tensor],
+        layout: EntityLayout,
+        index: TrajectoryIndex,
+        *,
+        batch_size: int,
+        smoothing: int,
+        lookahead: int,
+        every: int,
+    ) -> None:
+        state_keys = list(layout.in_keys)
+        in_keys = getattr(estimator, "in_keys", None)
+        in_keys = [as_key(k) for k in in_keys] if in_keys else state_keys
+        reads_state_only = set(in_keys) <= set(state_keys)
+        # Whether the state after the last row of a trajectory takes part.
+        self._final = reads_state_only and (smoothing > 1 or lookahead > 0)
+        layout.check(data[:1], next=self._final)
+        self._states = _select(data, in_keys)
+        self._next_states = (
+            _select(data.get(layout.next_key), in_keys) if self._final else None
+        )
+        self._estimator = estimator
+        self._layout = layout
+        self._index = index
+        self._batch_size = batch_size
+        self._past = smoothing // 2
+        self._future = (smoothing - 1) // 2
+        self._lookahead = lookahead
+        self._every = every
+        self._is_full = index.length == data.shape[0]
+        self._device = _device(estimator)
+        self._is_prepared = False
+        self._blocks: dict[int, _Block] = {}
+        self.num_chunks = -(-index.length // batch_size)
+        self.feature_shape: tuple[int, ...] | None = None
+
+    def span(self, c: int) -> slice:
+        """Returns the rows of chunk ``c``."""
+        start = c * self._batch_size
+        return slice(start, min(start + self._batch_size, self._index.length))
+
+    def is_stale(self, c: int, leaf: torch.Tensor) -> bool:
+        """Returns whether chunk ``c`` has, or its windows reach, an unscored row."""
+        # Trajectories do not matter here: if one was overwritten in part, the rest of
+        # it has lost neighbors too.
+        rows, _ = self._reach(c, ring=self._is_full)
+        return bool(leaf[rows.to(leaf.device)].isnan().any())
+
+    def block(self, b: int) -> _Block:
+        """Returns the raw scores of a block, computed once.
+
+        Args:
+            b (int): the number of the block.
+
+        Returns:
+            tuple of torch.Tensor: the scores of the states of its ``n`` rows and of
+            the states after them, float32 ``[n, *feature_shape]``, NaN where they are
+            not needed; and which rows are the last of their trajectories, bool
+            ``[n]``.
+        """
+        if b not in self._blocks:
+            span = self.span(b)
+            rows = torch.arange(span.start, span.stop)
+            last = self._index.is_last(rows).cpu()
+            position = self._position(rows)
+            state = self._scores(
+                self._states, rows, position % self._every == 0, "state"
+            )
+            after = state
+            if self._next_states is not None and bool(last.any()):
+                needed = last & ((position + 1) % self._every == 0)
+                after = self._scores(self._next_states, rows, needed, "next state")
+            self._blocks[b] = state, after, last
+        return self._blocks[b]
+
+    def chunk(self, c: int) -> torch.Tensor:
+        """Returns the final scores of chunk ``c``, float32 ``[n, *feature_shape]``."""
+        rows, first = self._reach(c, ring=self._index.wraps)
+        blocks = rows // self._batch_size
+        needed = blocks.unique().tolist()
+        # Keep no more blocks than one chunk reaches.
+        self._blocks = {b: v for b, v in self._blocks.items() if b in needed}
+        parts = [self.block(b) for b in needed]
+        shape = (len(rows), *parts[0][0].shape[1:])
+        state, after = torch.empty(shape), torch.empty(shape)
+        last = torch.empty(len(rows), dtype=torch.bool)
+        for b, (block_state, block_after, block_last) in zip(
+            needed, parts, strict=True
+        ):
+            here = blocks == b
+            offset = rows[here] - b * self._batch_size
+            state[here] = block_state[offset]
+            after[here] = block_after[offset]
+            last[here] = block_last[offset]
+        # All states in the order of time: the state of each row, and after the last
+        # row of a trajectory its next state.
+        ended = last.cumsum(0) - last.long()
+        place = torch.arange(len(rows))
+        trajectory = ended
+        raw = state
+        if self._final:
+            place = place + ended
+            size = len(rows) + int(last.sum())
+            raw = torch.empty((size, *shape[1:]))
+            raw[place] = state
+            raw[place[last] + 1] = after[last]
+            trajectory = torch.empty(size, dtype=torch.long)
+            trajectory[place] = ended
+            trajectory[place[last] + 1] = ended[last]
+        if self._every > 1:
+            raw = fill_between(raw, trajectory, ~raw.flatten(1).isnan().any(1))
+        smoothed = smooth(raw, trajectory, self._past, self._future)
+        best = max_ahead(smoothed, trajectory, self._lookahead)
+        span = self.span(c)
+        return best[place[first : first + span.stop - span.start]]
+
+    def _reach(self, c: int, *, ring: bool) -> tuple[torch.Tensor, int]:
+        """The rows that a chunk reads, and how many of them precede the chunk."""
+        span, gap = self.span(c), self._every - 1
+        before = self._past + gap
+        start, stop = span.start - before, span.stop + self._future + self._lookahead
+        if ring:
+            return torch.arange(start, stop + gap) % self._index.length, before
+        stop = min(stop + gap, self._index.length)
+        return torch.arange(max(0, start), stop), min(before, span.start)
+
+    def _position(self, rows: torch.Tensor) -> torch.Tensor:
+        """How many rows of the same trajectory precede each row, int64 ``[n]``."""
+        if self._every == 1:
+            return torch.zeros_like(rows)  # every state is scored
+        index = self._index
+        position = index.position(rows.to(index.device))
+        number = torch.searchsorted(index.ends, position)
+        start = index.ends[number] - index.lengths[number] + 1
+        return (position - start).cpu()
+
+    def _scores(
+        self,
+        states: TensorDictBase,
+        rows: torch.Tensor,
+        needed: torch.Tensor,
+        what: str,
+    ) -> torch.Tensor:
+        """The raw scores of some of a block's rows, NaN in the others."""
+        if bool(needed.all()):
+            span = slice(int(rows[0]), int(rows[-1]) + 1)
+            return self._evaluate(states[span], rows, what)
+        chosen = rows[needed]
+        found = None
+        if len(chosen):
+            found = self._evaluate(
+                states[chosen.to(states.device or "cpu")], chosen, what
+            )
+        assert self.feature_shape is not None  # the first row is always scored
+        scores = torch.full((len(rows), *self.feature_shape), torch.nan)
+        if found is not None:
+            scores[needed] = found
+        return scores
+
+    def _prepare(self) -> None:
+        """Shows the estimator a sample, the same when an interrupted call resumes."""
+        prepare = getattr(self._estimator, "prepare", None)
+        if prepare is not None and not self._is_prepared:
+            length = self._index.length
+            count = min(length, _SAMPLE)
+            rows = torch.linspace(0, length - 1, count, dtype=torch.float64).long()
+            sample = self._states[rows.to(self._states.device or "cpu")]
+            if self._device is not None:
+                sample = sample.to(self._device)
+            prepare(sample, length, smoothing=self._past + self._future + 1)
+        self._is_prepared = True
+
+    def _evaluate(
+        self, states: TensorDictBase, rows: torch.Tensor, what: str
+    ) -> torch.Tensor:
+        """The estimator's scores of states ``[n]``, checked."""
+        self._prepare()
+        # A copy: the estimator may write into its input.
+        states = states.clone()
+        if self._device is not None:
+            states = states.to(self._device)
+        for name, value in states.items(include_nested=True, leaves_only=True):
+            if value.is_floating_point():
+                finite = value.isfinite().reshape(len(rows), -1).all(-1).cpu()
+                if not bool(finite.all()):
+                    raise ValueError(
+                        f"{name!r} has NaN or infinite values in the {what} of the "
+                        f"rows {_some(rows[~finite])}: remove or repair them"
+                    )
+        scores = self._estimator(states)
+        self._check_shape(scores, len(rows))
+        scores = scores.detach().to("cpu", torch.float32)
+        self._check_finite(scores, rows, what)
+        self.feature_shape = tuple(scores.shape[1:])
+        return scores
+
+    def _check_shape(self, scores: Any, count: int) -> None:
+        if not isinstance(scores, torch.Tensor) or not scores.is_floating_point():
+            raise ValueError(
+                "the estimator must return a floating-point tensor, got "
+                f"{getattr(scores, 'dtype', type(scores).__name__)}"
+            )
+        n = self._layout.num_entities
+        expected = [(count, n), (count, n + 1, n)]
+        if self.feature_shape is not None:
+            expected = [(count, *self.feature_shape)]
+        if tuple(scores.shape) not in expected:
+            raise ValueError(
+                f"the estimator returned the shape {list(scores.shape)} for {count} "
+                "states, expected "
+                + " or ".join(str(list(shape)) for shape in expected)
+                + f": the last dimension is the {n} entities of its layout"
+            )
+
+    def _check_finite(
+        self, scores: torch.Tensor, rows: torch.Tensor, what: str
+    ) -> None:
+        finite = scores.isfinite()
+        if bool(finite.all()):
+            return
+        names = self._layout.names
+        bad_rows = ~finite.reshape(len(rows), -1).all(-1)
+        bad = (~finite.reshape(-1, len(names)).all(0)).tolist()
+        bad_names = [name for name, is_bad in zip(names, bad, strict=True) if is_bad]
+        raise ValueError(
+            f"the estimator returned NaN or infinite scores for the entities "
+            f"{bad_names} in the {what} of the rows {_some(rows[bad_rows])}: the model "
+            "has diverged, or the states are far outside of its data"
+        )
+
+
+def _select(data: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
+    chosen = TensorDict({}, batch_size=data.batch_size, device=data.device)
+    for key in keys:
+        value = data.get(key, None)
+        if value is None:
+            raise missing_key(
+                data,
+                key,
+                "the storage lacks what the estimator reads,",
+                "add it, or name the key that has it in the estimator",
+            )
+        chosen.set(key, value)
+    return chosen
+
+
+def _device(estimator: Any) -> torch.device | None:
+    if not isinstance(estimator, nn.Module):
+        return None
+    for tensor in (*estimator.parameters(), *estimator.buffers()):
+        return tensor.device
+    return None
+
+
+def _some(rows: torch.Tensor) -> str:
+    named = rows[:_NAMED].tolist()
+    more = len(rows) - len(named)
+    return f"{named} and {more} more" if more else str(named)
