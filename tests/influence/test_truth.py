@@ -53,7 +53,7 @@ FREE = [0.0, 0.0, 0.0, 5.0, 0.0]
 
 
 class TestTrueInfluence:
-    def test_what_is_held_is_influenced(self):
+    def test_a_held_entity_is_influenced(self):
         truth = true_influence(Table(), [HELD, FREE], progress=False)
         assert truth.influenced.dtype == torch.bool
         assert truth.influenced.tolist() == [[True, True, False], [True, False, False]]
@@ -78,7 +78,7 @@ class TestTrueInfluence:
         three = true_influence(Table(), [HELD], horizon=3, progress=False).displacement
         assert torch.allclose(three, 3 * one)
 
-    def test_inputs(self):
+    def test_arrays_tensors_lists_and_factories(self):
         states = np.array([HELD, FREE])
         expected = true_influence(Table(), states, progress=False)
         for same in (torch.tensor(states), states.tolist(), [np.array(HELD), FREE]):
@@ -106,15 +106,15 @@ class TestTrueInfluence:
             ({"num_workers": 1}, "picklable function"),
             ({"threshold": 0.0}, "positive distance"),
             ({"threshold": float("nan")}, "positive distance"),
-            ({"threshold": {"cup": 1.0}}, r"\['cup'\], wanted.*\['ball', 'cup'\]"),
+            ({"threshold": {"cup": 1.0}}, r"\['cup'\], expected.*\['ball', 'cup'\]"),
         ],
     )
-    def test_bad_input(self, changes, message):
+    def test_rejects_bad_input(self, changes, message):
         states = changes.pop("states", [HELD])
         with pytest.raises(ValueError, match=message):
             true_influence(Table(), states, progress=False, **changes)
 
-    def test_unbounded_actions(self):
+    def test_rejects_unbounded_actions(self):
         with pytest.raises(ValueError, match="finite"):
             draw_actions([-np.inf], [1.0], 4)
 
@@ -129,11 +129,11 @@ class Fenced(Table):
         return np.array([True, state[4] > 0, False])
 
     def outcomes(self, state, actions, *, horizon=1):
-        assert state[4] > 0, "simulated though all is out of reach"
+        assert state[4] > 0, "simulated although everything is out of reach"
         return super().outcomes(state, actions, horizon=horizon)
 
 
-def test_what_is_out_of_reach_is_not_simulated():
+def test_states_out_of_reach_are_not_simulated():
     states = [HELD, FREE, HELD, FREE]
     expected = true_influence(Table(), states, horizon=2, progress=False)
     spared = true_influence(Fenced(), states, horizon=2, progress=False)
@@ -144,15 +144,15 @@ def test_what_is_out_of_reach_is_not_simulated():
 
 
 class Interrupted(Table):
-    """Notes the states that it is asked about, and is killed at one of them."""
+    """Records the states of its queries, and is interrupted at one of them."""
 
-    asked: ClassVar[list[float]] = []
+    queried: ClassVar[list[float]] = []
     last = math.inf
 
     def outcomes(self, state, actions, *, horizon=1):
         if state[0] >= self.last:
             raise KeyboardInterrupt
-        self.asked.append(float(state[0]))
+        self.queried.append(float(state[0]))
         return super().outcomes(state, actions, horizon=horizon)
 
 
@@ -191,7 +191,7 @@ class TestSimulatorInfluence:
     def oracle(self, factory=Table, **kwargs):
         return SimulatorInfluence(factory, state_key=("info", "simulator"), **kwargs)
 
-    def test_is_the_truth_as_scores(self, rows):
+    def test_scores_are_the_ground_truth(self, rows):
         states = rows["info", "simulator"]
         truth = true_influence(Table(), states, progress=False)
         score = self.oracle()(rows)
@@ -202,25 +202,25 @@ class TestSimulatorInfluence:
         assert torch.equal(strict, torch.tensor([[1.0, 0, 0]]).expand(9, 3))
 
     def test_processes_get_the_factory(self, rows, monkeypatch):
-        asked = []
+        calls = []
 
         def recorder(env, states, **kwargs):
-            asked.append((env, kwargs["num_workers"]))
+            calls.append((env, kwargs["num_workers"]))
             return true_influence(env, states, **{**kwargs, "num_workers": 0})
 
         oracles = [self.oracle(num_workers=n) for n in (0, 3)]
         monkeypatch.setattr("torchrl_caiac.influence.truth.true_influence", recorder)
         scores = [oracle(rows) for oracle in oracles]
         assert torch.equal(*scores)
-        assert isinstance(asked[0][0], Table) and asked[0][1] == 0
-        assert asked[1] == (Table, 3)
-        # It does not change the truth, so it may change between two calls.
+        assert isinstance(calls[0][0], Table) and calls[0][1] == 0
+        assert calls[1] == (Table, 3)
+        # The number of processes does not change the scores, so it may change.
         assert repr(oracles[0]) == repr(oracles[1])
 
-    def test_killed_and_called_again(self, rows, tmp_path, monkeypatch):
+    def test_an_interrupted_call_resumes(self, rows, tmp_path, monkeypatch):
         rows.memmap(tmp_path / "rows")
         options = {"key": ("oracle", "score"), "batch_size": 2, "lookahead": 0}
-        monkeypatch.setattr(Interrupted, "asked", [])
+        monkeypatch.setattr(Interrupted, "queried", [])
 
         def score(**kwargs):
             data = TensorDict.load_memmap(tmp_path / "rows")
@@ -235,27 +235,80 @@ class TestSimulatorInfluence:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(Interrupted, "last", 5)
             score()
-        assert Interrupted.asked == [0, 1, 2, 3, 4]
-        Interrupted.asked.clear()
+        assert Interrupted.queried == [0, 1, 2, 3, 4]
+        Interrupted.queried.clear()
         result = score()
-        # What was scored by then is not asked for again, but for the torn chunk.
-        assert Interrupted.asked == [4, 5, 6, 7, 8]
+        # Only the interrupted chunk is queried again.
+        assert Interrupted.queried == [4, 5, 6, 7, 8]
         assert torch.equal(result, self.oracle()(rows))
-        Interrupted.asked.clear()
+        Interrupted.queried.clear()
         assert torch.equal(score(num_workers=0), result)
-        assert not Interrupted.asked
+        assert not Interrupted.queried
         with pytest.raises(ValueError, match="estimator was"):
             score(num_actions=7)
         with pytest.raises(ValueError, match="estimator was"):
             score(threshold=1e-4)
 
+    def test_state_of_several_leaves(self, rows):
+        whole = rows["info", "simulator"]
+        rows["sim"] = TensorDict({"q": whole[:, :2], "v": whole[:, 2:]}, [9])
+        parts = SimulatorInfluence(Table, state_key=[("sim", "q"), ("sim", "v")])
+        assert parts.in_keys == [("sim", "q"), ("sim", "v")]
+        assert torch.equal(parts(rows), self.oracle()(rows))
+        assert "[('sim', 'q'), ('sim', 'v')]" in repr(parts)
+        with pytest.raises(KeyError, match=r"state of the simulator.*they have"):
+            parts(rows.exclude("sim"))
+
+    @pytest.mark.parametrize("every", [1, 2, 3, 7])
+    @pytest.mark.parametrize("lookahead", [0, 4, 100])
+    def test_every_and_lookahead(self, every, lookahead, monkeypatch):
+        # Against masks that are filled in and looked ahead by hand.
+        lengths, generator = [1, 5, 8, 9, 20], torch.Generator().manual_seed(1)
+        episode = torch.arange(5).repeat_interleave(torch.tensor(lengths))
+        position = torch.cat([torch.arange(n) for n in lengths])
+        count = len(position)
+        state = torch.zeros(count, 5, dtype=torch.float64)
+        state[:, 0] = torch.arange(count)
+        state[:, 4] = torch.rand(count, generator=generator) < 0.2
+        data = TensorDict(
+            {
+                "observation": state,
+                "simulator": state,
+                "episode": episode,
+                "next": {"observation": state},
+            },
+            [count],
+        )
+        queried = position % every == 0
+        known = true_influence(Table(), state[queried], progress=False).influenced
+        mask = torch.zeros(count, 3, dtype=torch.bool)
+        mask[queried] = known
+        before = torch.arange(count) - position % every
+        after = (before + every).clamp(max=count - 1)
+        alone = queried | (episode[after] != episode)
+        mask = mask[before] | mask[before.where(alone, after)]
+        expected = torch.stack(
+            [
+                mask[t : t + lookahead + 1][episode[t : t + lookahead + 1] == e].any(0)
+                for t, e in enumerate(episode)
+            ]
+        )
+        monkeypatch.setattr(Interrupted, "queried", [])
+        rb = offline_buffer(data)
+        options = {"lookahead": lookahead, "every": every, "progress": False}
+        score_buffer(rb, SimulatorInfluence(Interrupted), 6, **options)
+        score = rb.storage[:]["caiac", "score"]
+        assert torch.equal(score, expected.float())
+        assert 0 < score[:, 1].mean() < 1
+        assert Interrupted.queried == queried.nonzero()[:, 0].tolist()
+
 
 class TestFetchPush:
-    """What ``in_reach`` spares the simulator is not influenced."""
+    """States that ``in_reach`` excludes have no influence."""
 
     def test_of_nearly_reached_cubes(self):
-        # The rest of the bound: cubes that are just out of reach do not move, and not
-        # because they are far away.
+        # The bound is tight: cubes that are just out of reach do not move although they
+        # are near.
         env, states, distances = FetchPushCubes(2), [], []
         for seed in range(12):
             rng = np.random.default_rng(seed)
@@ -277,12 +330,12 @@ class TestFetchPush:
         nearest = np.argsort(spared.min(1))[:80]
         assert spared[nearest].min() < 0.14
         truth = true_influence(
-            Everything(), [states[i] for i in nearest], **ASKED
+            Everything(), [states[i] for i in nearest], **QUERY
         ).displacement[:, 1:]
         assert truth[~torch.from_numpy(reached[nearest])].max() < 1e-4
         # In reach, many are influenced.
         nearest = np.argsort(np.min(distances, axis=1))[:20]
-        influenced = true_influence(simulator, [states[i] for i in nearest], **ASKED)
+        influenced = true_influence(simulator, [states[i] for i in nearest], **QUERY)
         assert influenced.influenced[:, 1:].any(1).float().mean() > 0.8
 
     def test_of_cubes_that_push_cubes(self):
@@ -304,7 +357,7 @@ class TestFetchPush:
         # A row before the hand, with gaps of 3 mm; then its last cube alone.
         row = [[x, y + 0.043 + 0.053 * i] for i in range(4)]
         states = [moved(*row), moved(*aside[:3], row[3])]
-        truth = true_influence(Everything(4), states, **ASKED).influenced
+        truth = true_influence(Everything(4), states, **QUERY).influenced
         assert truth.tolist() == [[True] * 5, [True, False, False, False, False]]
         simulator = FetchPushTruth(4)
         assert [simulator.in_reach(state).tolist() for state in states] == (
@@ -317,7 +370,7 @@ class TestFetchPush:
         simulator, state = FetchPushTruth(1), env.simulator_state()
         reached = [simulator.in_reach(state, horizon=h)[1] for h in (1, 4)]
         assert reached == [False, True]
-        truth = true_influence(Everything(1), [state], horizon=1, **ASKED)
+        truth = true_influence(Everything(1), [state], horizon=1, **QUERY)
         assert not truth.influenced[0, 1]
 
 
@@ -328,7 +381,7 @@ class Everything(FetchPushTruth):
         return np.ones(len(self.layout), dtype=np.bool_)
 
 
-ASKED = {"num_actions": 24, "threshold": 1e-3, "progress": False}
+QUERY = {"num_actions": 24, "threshold": 1e-3, "progress": False}
 
 
 @pytest.fixture(scope="module")
@@ -337,9 +390,9 @@ def env():
 
 
 class TestKitchen:
-    """The real simulator; the threshold's reasons, measured."""
+    """The simulator of the kitchen: why the default threshold is 2 mm."""
 
-    def test_out_of_reach_nothing_differs(self, env):
+    def test_actions_make_no_difference_out_of_reach(self, env):
         # The noise of the solver: the arm in its default posture touches nothing, so
         # whatever differs between actions does so by noise alone.
         rng = np.random.default_rng(0)
@@ -350,7 +403,7 @@ class TestKitchen:
         assert truth.displacement[:, 1:].max() < 1e-8
         assert truth.displacement[:, 0].min() > 0.05
 
-    def test_own_motion_is_no_influence(self, env):
+    def test_motion_without_the_robot_is_no_influence(self, env):
         # A door that swings: far moved, but the same under every action.
         velocity = np.zeros(29)
         velocity[22] = -3.0
@@ -360,7 +413,7 @@ class TestKitchen:
         truth = true_influence(env, state[None], num_actions=4, progress=False)
         assert not truth.influenced[0, 1:].any()
 
-    def test_contact_is_seen(self, env):
+    def test_contact_is_influence(self, env):
         # The kettle against the hand.
         state = env.default_state()
         hand = env.data
@@ -373,7 +426,7 @@ class TestKitchen:
         others = [i for i in range(1, 10) if i != kettle]
         assert not truth.influenced[0, others].any()
 
-    def test_contact_is_not_subtle(self):
+    def test_masks_hardly_depend_on_the_threshold(self):
         # Along a demonstration: nothing at first, then the kettle, never another
         # object; and a threshold far from 2 mm gives the same answer.
         env = KitchenEnv("kettle", terminate_on_success=False)
@@ -393,7 +446,7 @@ class TestKitchen:
         for threshold in (3e-4, 1e-3, 4e-3):
             assert torch.equal(truth.displacement[:, kettle] > threshold, contacts)
 
-    def test_processes_change_nothing(self, env):
+    def test_processes_give_the_same_result(self, env):
         rng = np.random.default_rng(1)
         starts = np.stack([env.random_start("kettle", rng=rng) for _ in range(9)])
         velocity = rng.normal(0, 0.5, (9, 29))

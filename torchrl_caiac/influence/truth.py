@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from tqdm import tqdm
 
-from torchrl_caiac.experiments import end_with_parent
+from torchrl_caiac._keys import as_key, get_leaf
+from torchrl_caiac._processes import run_in_processes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -34,15 +34,16 @@ _logger = logging.getLogger("torchrl_caiac.truth")
 
 #: Default distance, in metres or radians, from which an entity counts as influenced.
 INFLUENCE_DISTANCE = 2e-3
+_CHUNK = 8  # states in one job
 
 
 class InfluenceSimulator(Protocol):
     """What :func:`true_influence` needs of an environment.
 
     It may also have ``in_reach(state, *, horizon=1)``, which returns bool ``[N]``:
-    false for an entity that no action can possibly move. A state in which all entities
-    that are not fixed are out of reach is then not simulated; this has to be a safe
-    bound, since nothing else notices influence there.
+    ``False`` for an entity that no action can move. A state in which all entities that
+    are not fixed are out of reach is not simulated. The bound must be safe, since
+    influence that it misses is not noticed.
     """
 
     @property
@@ -56,18 +57,18 @@ class InfluenceSimulator(Protocol):
     def outcomes(
         self, state: Any, actions: NDArray[np.float64], *, horizon: int = 1
     ) -> NDArray[np.float64]:
-        """Return the noise-free next states ``[K, D]`` after actions ``[K, A]``."""
+        """Returns the noise-free next states ``[K, D]`` after actions ``[K, A]``."""
 
 
 class TrueInfluence(NamedTuple):
-    """The simulator's answer.
+    """The ground truth for some states.
 
     Attributes:
         influenced: bool ``[S, N]``, in the order of the layout; fixed entities (the
             robot) are always influenced.
-        displacement: float32 ``[S, N]``, the largest distance between an entity's next
-            states under any two of the actions (metres and radians alike); 0 in states
-            whose simulation was spared by ``in_reach``.
+        displacement: float32 ``[S, N]``, the largest distance between the next states
+            of an entity under any two of the actions, in metres or radians; 0 in states
+            that were not simulated because of ``in_reach``.
     """
 
     influenced: torch.Tensor
@@ -77,27 +78,31 @@ class TrueInfluence(NamedTuple):
 def draw_actions(
     low: ArrayLike, high: ArrayLike, num_actions: int, *, seed: int = 0
 ) -> NDArray[np.float64]:
-    """Draw uniform actions from a box.
+    """Draws uniform actions from a box.
 
     Args:
-        low: lower bounds ``[A]``.
-        high: upper bounds ``[A]``.
-        num_actions: how many.
+        low (array_like): the lower bounds, ``[A]``.
+        high (array_like): the upper bounds, ``[A]``.
+        num_actions (int): the number of actions, at least 2.
 
     Keyword Args:
-        seed: equal seeds give equal actions.
+        seed (int): equal seeds give equal actions. Defaults to 0.
 
     Returns:
-        actions ``[num_actions, A]``.
+        numpy.ndarray: actions, float64 ``[num_actions, A]``.
 
-    Example:
+    Raises:
+        ValueError: a bound is not finite, or there are fewer than two actions.
+
+    Examples:
+        >>> from torchrl_caiac.influence.truth import draw_actions
         >>> draw_actions([-1, -1], [1, 1], 16).shape
         (16, 2)
     """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     if num_actions < 2:
         raise ValueError(
-            f"num_actions is {num_actions}, wanted at least 2: influence is a "
+            f"num_actions is {num_actions}, expected at least 2: influence is a "
             "difference between actions"
         )
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -116,50 +121,121 @@ def true_influence(
     num_workers: int = 0,
     progress: bool = True,
 ) -> TrueInfluence:
-    """Ask the simulator which entities an action can move, in each of many states.
+    """Queries the simulator for the entities that an action can move, state by state.
 
-    From each state every one of ``num_actions`` uniform actions (the same for all
+    From each state, every one of ``num_actions`` uniform actions (the same for all
     states) is simulated without noise. An entity is influenced if two of the actions
-    lead it to places more than ``threshold`` apart: the truth that the estimators of
-    eq. 3 approximate. What an entity does on its own (a kettle that slides on after a
-    push) is the same under every action and does not count.
+    bring it to places more than ``threshold`` apart. This is the ground truth that
+    estimators of eq. 3 approximate. What an entity does on its own (a kettle that
+    slides on after a push) is the same under every action and does not count.
 
-    Why 2 mm (or mrad): the solver adds no noise to tell from contact (entities that the
-    robot does not touch differ by less than 1e-8 between actions), and contact is not
-    subtle. In the states of scripted microwave and kettle demonstrations, 146 of the
-    147 displacements above 1e-8 are above 2 mm and every threshold from 0.3 to 4 mm
-    gives the same masks. Below that, nobody could use the difference: the observation
-    noise of an object is up to 0.05 mm, a task needs 0.3, and the world models take
-    differences under their floor of 2 mm for noise. The tests measure both. Sixteen
-    actions miss 3 of 27 contacts that 48 actions find in every sixth of these states.
+    The default of 2 mm (or mrad) separates contact from no contact. Without contact,
+    entities differ by less than 1e-8 between actions. In the states of scripted
+    microwave and kettle demonstrations, 146 of the 147 displacements above 1e-8 are
+    above 2 mm, and every threshold from 0.3 to 4 mm gives the same masks. Smaller
+    differences have no use: the observation noise of an object is up to 0.05 mm, a task
+    tolerates 0.3, and the world models treat differences below their floor of 2 mm as
+    noise. Sixteen actions miss 3 of 27 contacts that 48 actions find in every sixth of
+    these states.
 
     Args:
-        env: a simulator, or a picklable function without arguments that makes one (the
-            class :class:`~torchrl_caiac.envs.kitchen.KitchenEnv` itself will do).
-        states: ``[S, ...]``, whatever ``env.outcomes`` takes: for the kitchen
-            positions ``[S, 30]``, positions and velocities ``[S, 59]``, or a list of
-            snapshots.
+        env (InfluenceSimulator or callable): a simulator, or a picklable function
+            without arguments that creates one, such as the class
+            :class:`~torchrl_caiac.envs.kitchen.KitchenEnv`.
+        states (array_like or sequence): ``[S, ...]``, what ``env.outcomes`` takes. For
+            the kitchen positions ``[S, 30]``, positions and velocities ``[S, 59]``, or
+            a list of snapshots.
 
     Keyword Args:
-        num_actions: actions a state, at least 2.
-        threshold: distance, one for all or one for each entity that is not fixed.
-        horizon: steps for which each action is held.
-        seed: of the actions.
-        num_workers: processes; 0 works in this one. More than 0 needs a function for
-            ``env``, and a script guarded by ``if __name__ == "__main__":``. The result
-            does not depend on it.
-        progress: show a progress bar.
+        num_actions (int): actions for each state, at least 2. Defaults to 16.
+        threshold (float or mapping of str to float): the distance from which an entity
+            is influenced, one for all or one for each entity that is not fixed.
+            Defaults to 2e-3.
+        horizon (int): the number of steps for which each action is held. Defaults to 1.
+        seed (int): the seed of the actions. Defaults to 0.
+        num_workers (int): the number of processes; 0 uses this process. More than 0
+            needs a function for ``env``, and a script with
+            ``if __name__ == "__main__":``. The result does not depend on it. Defaults
+            to 0.
+        progress (bool): show a progress bar. Defaults to ``True``.
 
     Returns:
-        masks and displacements, see :class:`TrueInfluence`.
+        TrueInfluence: masks and displacements.
 
-    Example:
+    Raises:
+        ValueError: there are no states, a state is not finite, or an argument is out of
+            range.
+
+    Examples:
         >>> from torchrl_caiac.envs.kitchen import KitchenEnv
+        >>> from torchrl_caiac.influence import true_influence
         >>> start = KitchenEnv.default_state()[None]
         >>> truth = true_influence(KitchenEnv, start, num_actions=2, progress=False)
         >>> truth.influenced.sum().item()  # the robot only
         1
     """
+    rows = _checked_states(states)
+    if num_workers < 0:
+        raise ValueError(f"num_workers is {num_workers}, expected 0 or more")
+    if num_workers and not callable(env):
+        raise ValueError(
+            "num_workers > 0 needs a picklable function that creates the environment, "
+            f"such as its class, got {env!r}"
+        )
+    simulator: InfluenceSimulator = env() if callable(env) else env
+    try:
+        layout, space = simulator.layout, simulator.action_space
+        if not layout.is_flat:
+            raise ValueError(
+                "the layout of the simulator is nested, expected a flat one: its "
+                "states are vectors"
+            )
+        limits = _limits(layout, threshold)
+        actions = draw_actions(space.low, space.high, num_actions, seed=seed)
+        columns = [list(layout.columns[name]) for name in layout.names]
+        free = [i for i, name in enumerate(layout.names) if name not in layout.fixed]
+        displacement = np.empty((len(rows), len(layout)), dtype=np.float32)
+        starts = range(0, len(rows), _CHUNK)
+        jobs = (
+            (rows[start : start + _CHUNK], actions, columns, free, horizon)
+            for start in starts
+        )
+        found = (
+            run_in_processes(
+                _displacements,
+                jobs,
+                processes=num_workers,
+                setup=env,  # type: ignore[arg-type]
+            )
+            if num_workers
+            else run_in_processes(partial(_displacements, simulator), jobs, processes=0)
+        )
+        with tqdm(
+            total=len(rows),
+            desc="ground truth",
+            unit="state",
+            disable=not progress,
+            leave=False,
+        ) as bar:
+            for number, values in found:
+                start = starts[number]
+                displacement[start : start + len(values)] = values
+                bar.update(len(values))
+    finally:
+        if callable(env) and hasattr(simulator, "close"):
+            simulator.close()
+    influenced = displacement > limits
+    _logger.info(
+        "ground truth of %d states: influenced %s",
+        len(rows),
+        dict(zip(layout.names, influenced.mean(0).round(3).tolist(), strict=True)),
+    )
+    return TrueInfluence(torch.from_numpy(influenced), torch.from_numpy(displacement))
+
+
+def _checked_states(
+    states: ArrayLike | Sequence[Any],
+) -> Sequence[Any] | NDArray[np.float64]:
     rows: Sequence[Any] | NDArray[np.float64]
     if isinstance(states, torch.Tensor):
         rows = states.detach().cpu().numpy()
@@ -168,68 +244,15 @@ def true_influence(
     else:
         rows = list(states)  # type: ignore[arg-type]
     if len(rows) == 0:
-        raise ValueError("states is empty: there is nothing to ask the simulator")
+        raise ValueError("states is empty: give at least one state")
     if isinstance(rows, np.ndarray):
         bad = ~np.isfinite(rows.reshape(len(rows), -1)).all(-1)
         if bad.any():
             raise ValueError(
-                f"states holds non-finite values in {int(bad.sum())} rows, the first "
-                f"at {int(bad.argmax())}: drop them"
+                f"states has non-finite values in {int(bad.sum())} rows, the first at "
+                f"{int(bad.argmax())}: drop them"
             )
-    if num_workers < 0:
-        raise ValueError(f"num_workers is {num_workers}, wanted 0 or more")
-    factory = env if callable(env) else None
-    if num_workers and factory is None:
-        raise ValueError(
-            "num_workers > 0 needs a picklable function that makes the environment "
-            f"(say its class), got {env!r}"
-        )
-    simulator: InfluenceSimulator = env() if callable(env) else env
-    layout = simulator.layout
-    if not layout.is_flat:
-        raise ValueError("the simulator's layout must be flat: its states are vectors")
-    limits = _limits(layout, threshold)
-    columns = [list(layout.columns[name]) for name in layout.names]
-    free = [i for i, name in enumerate(layout.names) if name not in layout.fixed]
-    space = simulator.action_space
-    actions = draw_actions(space.low, space.high, num_actions, seed=seed)
-    displacement = np.empty((len(rows), len(layout)), dtype=np.float32)
-    bar = tqdm(
-        total=len(rows),
-        desc="true influence",
-        unit="state",
-        disable=not progress,
-        leave=False,
-    )
-    with bar:
-        done: Iterator[NDArray[np.float64]]
-        if factory is None or num_workers == 0:
-            for i, row in enumerate(rows):
-                displacement[i] = _displacement(
-                    simulator, row, actions, columns, free, horizon
-                )
-                bar.update()
-        else:
-            if hasattr(simulator, "close"):
-                simulator.close()
-            # spawn: forked copies of torch's and OpenGL's threads may hang.
-            with ProcessPoolExecutor(
-                num_workers,
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_start_worker,
-                initargs=(factory, actions, columns, free, horizon),
-            ) as pool:
-                done = pool.map(_work, rows, chunksize=8)
-                for i, values in enumerate(done):
-                    displacement[i] = values
-                    bar.update()
-    influenced = displacement > limits
-    _logger.info(
-        "true influence of %d states: %s",
-        len(rows),
-        dict(zip(layout.names, influenced.mean(0).round(3).tolist(), strict=True)),
-    )
-    return TrueInfluence(torch.from_numpy(influenced), torch.from_numpy(displacement))
+    return rows
 
 
 def _limits(
@@ -239,8 +262,8 @@ def _limits(
     if isinstance(threshold, Mapping):
         if set(threshold) != set(free):
             raise ValueError(
-                f"threshold names {sorted(threshold)}, wanted every entity that is not "
-                f"fixed: {sorted(free)}"
+                f"threshold names {sorted(threshold)}, expected every entity that is "
+                f"not fixed: {sorted(free)}"
             )
         values = dict(threshold)
     else:
@@ -248,94 +271,93 @@ def _limits(
     for name, value in values.items():
         if not (np.isfinite(value) and value > 0):
             raise ValueError(
-                f"the threshold of {name!r} is {value}, wanted a positive distance"
+                f"the threshold of {name!r} is {value}, expected a positive distance"
             )
     # Below every displacement: a fixed entity is always influenced.
     return np.array([values.get(name, -1.0) for name in layout.names], dtype=np.float32)
 
 
-def _displacement(
+def _displacements(
     simulator: InfluenceSimulator,
-    state: Any,
+    states: Sequence[Any] | NDArray[np.float64],
     actions: NDArray[np.float64],
     columns: list[list[int]],
     free: list[int],
     horizon: int,
 ) -> NDArray[np.float64]:
+    """The displacements ``[S, N]`` of the entities in some states."""
     in_reach = getattr(simulator, "in_reach", None)
-    if in_reach is not None and not in_reach(state, horizon=horizon)[free].any():
-        return np.zeros(len(columns))
-    after = simulator.outcomes(state, actions, horizon=horizon)
-    values = np.empty(len(columns))
-    for i, own in enumerate(columns):
-        part = after[:, own]
-        gap = np.linalg.norm(part[:, None] - part[None, :], axis=-1)
-        values[i] = gap.max()
-    return values
-
-
-_WORKER: dict[str, Any] = {}
-
-
-def _start_worker(
-    factory: Callable[[], InfluenceSimulator],
-    actions: NDArray[np.float64],
-    columns: list[list[int]],
-    free: list[int],
-    horizon: int,
-) -> None:
-    end_with_parent()
-    torch.set_num_threads(1)
-    _WORKER["arguments"] = (actions, columns, free, horizon)
-    _WORKER["simulator"] = factory()
-
-
-def _work(state: Any) -> NDArray[np.float64]:
-    return _displacement(_WORKER["simulator"], state, *_WORKER["arguments"])
+    result = np.zeros((len(states), len(columns)))
+    for values, state in zip(result, states, strict=True):
+        if in_reach is not None and not in_reach(state, horizon=horizon)[free].any():
+            continue
+        after = simulator.outcomes(state, actions, horizon=horizon)
+        for i, own in enumerate(columns):
+            part = after[:, own]
+            gap = np.linalg.norm(part[:, None] - part[None, :], axis=-1)
+            values[i] = gap.max()
+    return result
 
 
 def oracle_score(influenced: torch.Tensor) -> torch.Tensor:
-    """Return true masks as scores: 1 where influenced, else 0.
+    """Returns ground truth masks as scores: 1 where influenced, else 0.
 
     Args:
-        influenced: bool ``[T, N]``.
+        influenced (torch.Tensor): bool ``[T, N]``.
 
     Returns:
-        float32 ``[T, N]``, to be used with any threshold between 0 and 1.
+        torch.Tensor: float32 ``[T, N]``, for any threshold between 0 and 1.
 
-    Example:
+    Raises:
+        ValueError: ``influenced`` is not bool.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.influence import oracle_score
         >>> oracle_score(torch.tensor([[True, False]]))
         tensor([[1., 0.]])
     """
     if influenced.dtype != torch.bool:
-        raise ValueError(f"influenced has dtype {influenced.dtype}, wanted torch.bool")
+        raise ValueError(
+            f"influenced has dtype {influenced.dtype}, expected torch.bool"
+        )
     return influenced.to(torch.float32)
 
 
 class SimulatorInfluence:
-    """The simulator's truth as an estimator: scores of 1 where influenced, else 0.
+    """An estimator that queries the simulator: 1 where influenced, else 0.
 
-    For :func:`~torchrl_caiac.influence.score_buffer.score_buffer`, which then keeps the
-    truth beside the data, takes a killed call up again, and tells truths of different
-    settings apart. Use ``lookahead=0`` to judge other scores by it.
+    :func:`~torchrl_caiac.influence.score_buffer` writes its scores next to the data,
+    resumes interrupted calls, and never mixes scores of different settings. Use
+    ``lookahead=0`` for the ground truth of each row's state, and the same ``lookahead``
+    as for learned scores to train with the ground truth. ``score_buffer(..., every=n)``
+    queries only every ``n``-th state of a trajectory; a state in between counts as
+    influenced if one of the two around it is.
 
     Args:
-        factory: makes the simulator, see :func:`true_influence`; its class will do.
+        factory (callable): creates the simulator, see :func:`true_influence`; its class
+            will do.
 
     Keyword Args:
-        state_key: where each row has what ``outcomes`` takes, ``[*B, S]``.
-        num_actions: actions a state.
-        threshold: distance from which an entity is influenced, one for all or one for
-            each entity that is not fixed.
-        seed: of the actions.
-        num_workers: processes; 0 works in this one.
+        state_key (NestedKey or list of NestedKey): what ``outcomes`` takes, ``[*B,
+            S]``; the leaves of a list are concatenated. Defaults to ``"simulator"``.
+        num_actions (int): actions for each state. Defaults to 16.
+        threshold (float or mapping of str to float): the distance from which an entity
+            is influenced, one for all or one for each entity that is not fixed.
+            Defaults to 2e-3.
+        seed (int): the seed of the actions. Defaults to 0.
+        num_workers (int): the number of processes; 0 uses this process. Defaults to 0.
 
-    Example:
+    Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_caiac.envs.kitchen import KitchenEnv
-        >>> oracle = SimulatorInfluence(KitchenEnv, state_key="qpos", num_actions=2)
+        >>> from torchrl_caiac.influence import SimulatorInfluence
+        >>> oracle = SimulatorInfluence(
+        ...     KitchenEnv, state_key=["qpos", "qvel"], num_actions=2
+        ... )
         >>> start = torch.tensor(KitchenEnv.default_state())
-        >>> rows = TensorDict({"qpos": start[None]}, [1])
+        >>> rows = TensorDict({"qpos": start[None], "qvel": torch.zeros(1, 29)}, [1])
         >>> oracle(rows).sum()  # the robot only
         tensor(1.)
     """
@@ -344,14 +366,18 @@ class SimulatorInfluence:
         self,
         factory: Callable[[], InfluenceSimulator],
         *,
-        state_key: NestedKey = "simulator",
+        state_key: NestedKey | list[NestedKey] = "simulator",
         num_actions: int = 16,
         threshold: float | Mapping[str, float] = INFLUENCE_DISTANCE,
         seed: int = 0,
         num_workers: int = 0,
     ) -> None:
         self.factory = factory
-        self.state_key = unravel_key(state_key)
+        self.state_key: NestedKey | list[NestedKey] = (
+            [as_key(key) for key in state_key]
+            if isinstance(state_key, list)
+            else as_key(state_key)
+        )
         self.num_actions = num_actions
         self.threshold = threshold
         self.seed = seed
@@ -360,26 +386,39 @@ class SimulatorInfluence:
 
     @property
     def layout(self) -> EntityLayout:
-        """The simulator's layout."""
+        """The layout of the simulator."""
         return self._simulator.layout
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """The simulator's state."""
-        return [self.state_key]
+        """The keys of the simulator's state."""
+        key = self.state_key
+        return list(key) if isinstance(key, list) else [key]
 
     def __call__(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """Asks the simulator.
+        """Queries the simulator.
 
         Args:
-            tensordict: rows ``[T]`` with ``state_key``.
+            tensordict (TensorDictBase): rows ``[T]`` with ``state_key``.
 
         Returns:
-            float32 ``[T, N]``, 0 or 1.
+            torch.Tensor: float32 ``[T, N]``, 0 or 1.
+
+        Raises:
+            KeyError: the rows lack the state.
         """
+        leaves = [
+            get_leaf(
+                tensordict,
+                key,
+                "the data lack the state of the simulator",
+                "name the leaf that has it by state_key",
+            )
+            for key in self.in_keys
+        ]
         truth = true_influence(
             self.factory if self.num_workers else self._simulator,
-            tensordict[self.state_key],
+            leaves[0] if len(leaves) == 1 else torch.cat(leaves, -1),
             num_actions=self.num_actions,
             threshold=self.threshold,
             seed=self.seed,
@@ -389,7 +428,7 @@ class SimulatorInfluence:
         return oracle_score(truth.influenced)
 
     def __repr__(self) -> str:
-        """The settings that the result depends on."""
+        """Returns the settings that the result depends on."""
         return (
             f"{type(self).__name__}({self.factory!r}, state_key={self.state_key!r}, "
             f"num_actions={self.num_actions}, threshold={self.threshold}, "
