@@ -1,4 +1,4 @@
-"""Tests of the influence that is read from a transformer's attention."""
+"""Influence from the attention of a transformer."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def transitions(*batch: int, seed: int = 0) -> TensorDict:
 
 
 class Known(TransformerWorldModel):
-    """A model whose attention is given."""
+    """A model with a given attention."""
 
     def attention(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         return self.known.expand(*state.shape[:-1], *self.known.shape)
@@ -66,8 +66,8 @@ def test_one_layer_is_transposed() -> None:
 
 
 def test_layers_are_chained_from_the_input_to_the_output() -> None:
-    # First the cup reads the action, then the lid reads the cup. The other way round
-    # the lid would read a cup that knows nothing of the action yet.
+    # First the cup reads the action, then the lid reads the cup. In the opposite order
+    # the lid reads the cup before the cup has read the action.
     first, second = torch.eye(N + 1), torch.eye(N + 1)
     first[1] = torch.tensor([0.0, 0.0, 0.0, 1.0])
     second[2] = torch.tensor([0.0, 1.0, 0.0, 0.0])
@@ -87,7 +87,7 @@ def test_product_of_the_layers(batch: tuple[int, ...]) -> None:
     with torch.no_grad():
         layers = model.attention(LAYOUT.read(td), td["action"])
     slow = torch.zeros(*batch, N + 1, N)
-    # The sum over all paths of what is passed on along them.
+    # The sum over all paths of the products along them.
     for cause in range(N + 1):
         for effect in range(N):
             for a in range(N + 1):
@@ -129,7 +129,7 @@ def buffer(kind: str, path: Path, data: TensorDict) -> ReplayBuffer:
 
 
 @pytest.mark.parametrize("kind", ["memory", "memmap"])
-def test_cached_in_a_storage_for_coda_and_coda_action(
+def test_scores_in_a_storage_for_coda_and_coda_action(
     kind: str, tmp_path: Path
 ) -> None:
     data = transitions(60)
@@ -143,7 +143,7 @@ def test_cached_in_a_storage_for_coda_and_coda_action(
     stored = rb.storage[:]["coda", "graph"]
     torch.testing.assert_close(stored, graphs(data))
     torch.testing.assert_close(rb.storage[:]["coda", "action"], stored[:, -1])
-    # The state after the last row has no action, and is left out of its maximum.
+    # The state after the last row has no action, so the maximum is without it.
     ahead = {**options, "lookahead": 1, "key": ("coda", "ahead")}
     score_buffer(rb, graphs, **ahead)
     last = torch.arange(9, 60, 10)
@@ -167,7 +167,7 @@ def test_cached_in_a_storage_for_coda_and_coda_action(
     assert not (batch["caiac", "swapped"] & links).any()
 
 
-def test_what_has_no_attention_is_refused() -> None:
+def test_rejects_models_without_attention() -> None:
     with pytest.raises(TypeError, match="a GaussianWorldModel has no attention"):
         AttentionInfluence(GaussianWorldModel(LAYOUT, 2, (8,)))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"predicts no column of \['cup'\]"):
@@ -176,7 +176,7 @@ def test_what_has_no_attention_is_refused() -> None:
         AttentionInfluence(make(), max_memory=0)
 
 
-def test_values_that_are_not_finite_are_named() -> None:
+def test_rejects_input_that_is_not_finite() -> None:
     td = transitions(6)
     model = make()
     estimator = AttentionInfluence(model)
@@ -187,17 +187,17 @@ def test_values_that_are_not_finite_are_named() -> None:
     td["action"][5, 1] = torch.inf
     with pytest.raises(ValueError, match="'action' is inf in column 1 of row 5"):
         estimator(td)
-    with pytest.raises(KeyError, match="reads the action 'action'"):
+    with pytest.raises(KeyError, match=r"lack the action .*action"):
         estimator(td.exclude("action"))
 
 
-def test_attention_that_is_nan_is_named() -> None:
+def test_rejects_attention_that_is_nan() -> None:
     attention = torch.eye(N + 1)
     attention[1, 0] = torch.nan
-    with pytest.raises(ValueError, match=r"attention that \['cup'\] pay is NaN.*row 0"):
+    with pytest.raises(ValueError, match=r"attention of \['cup'\] is NaN.*row 0"):
         known(attention)(transitions(2))
     model = make()
     with torch.no_grad():
         model.layers[0].linear1.weight.fill_(torch.nan)
-    with pytest.raises(ValueError, match=r"\['arm', 'cup', 'lid'\] pay is NaN"):
+    with pytest.raises(ValueError, match=r"\['arm', 'cup', 'lid'\] is NaN"):
         AttentionInfluence(model)(transitions(2))

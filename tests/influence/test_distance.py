@@ -1,4 +1,4 @@
-"""Tests of influence by distance."""
+"""Influence by distance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PLACES: dict[str, Any] = {"arm": [1, 2], "cup": [5, 6], "box": [9, 8]}
 
 
 @given(st.integers(0, 2**31), st.sampled_from([(), (4,), (2, 3)]), st.booleans())
-def test_links_are_those_of_every_pair(
+def test_links_match_the_distances_of_all_pairs(
     seed: int, batch: tuple[int, ...], double: bool
 ) -> None:
     generator = torch.Generator().manual_seed(seed)
@@ -55,7 +55,7 @@ def test_nested_layouts_and_named_agents() -> None:
         DistanceInfluence(layout, {"arm": [1], "cup": [3]}, agent="cup")(td)
 
 
-def test_scores_the_last_next_state_too() -> None:
+def test_scores_the_state_after_the_last_row() -> None:
     layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
     rule = DistanceInfluence(layout, {"arm": [0], "cup": [1]})
     far, near = torch.tensor([[0.0, 1.0]]), torch.tensor([[0.0, 0.05]])
@@ -80,9 +80,9 @@ def test_scores_the_last_next_state_too() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"positions": {"arm": [0]}}, r"positions name \['arm'\], wanted all"),
-        ({"positions": {**PLACES, "box": [8]}}, "the same number for all"),
-        ({"positions": dict.fromkeys(PLACES, ())}, "at least 1"),
+        ({"positions": {"arm": [0]}}, r"positions name \['arm'\], expected all"),
+        ({"positions": {**PLACES, "box": [8]}}, "expected the same number"),
+        ({"positions": dict.fromkeys(PLACES, ())}, "at least 1, for all"),
         ({"positions": {**PLACES, "box": [8, 4]}}, r"'box' the columns \[4\], which"),
         ({"agent": "pot"}, "agent is 'pot', which is no entity"),
         ({"distance": 0.0}, "distance must be positive and finite, got 0.0"),
@@ -93,12 +93,12 @@ def test_scores_the_last_next_state_too() -> None:
         ),
     ],
 )
-def test_wrong_arguments(kwargs: dict[str, Any], message: str) -> None:
+def test_rejects_bad_arguments(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DistanceInfluence(**{"layout": LAYOUT, "positions": PLACES, **kwargs})
 
 
-def test_positions_that_are_not_finite() -> None:
+def test_rejects_positions_that_are_not_finite() -> None:
     x = torch.zeros(2, 10)
     x[1, 5], x[0, 0] = torch.nan, torch.nan  # column 0 is no position
     rule = DistanceInfluence(LAYOUT, PLACES)

@@ -1,4 +1,4 @@
-"""Tests of the compiled kernel of eq. 3 against a brute-force oracle."""
+"""The compiled kernel of eq. 3 against all pairs in float64."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from torchrl_caiac.influence import causal_action_influence, mixture_divergence
 from torchrl_caiac.influence.mixture_divergence import mixture_influence
 
 APPROXIMATIONS: tuple[Any, ...] = ("bounds", "product")
-# Each is a kernel of its own, which takes seconds to compile.
+# Each width needs its own kernel, which takes seconds to compile.
 WIDTHS = (1, 3, 7)
 
 
-def oracle(loc: torch.Tensor, var: torch.Tensor, approximation: str) -> torch.Tensor:
-    """Eq. 3 of Gaussians [B, K, d] in float64, all pairs written out."""
+def all_pairs(loc: torch.Tensor, var: torch.Tensor, approximation: str) -> torch.Tensor:
+    """Eq. 3 of Gaussians ``[B, K, d]`` in float64, with all pairs."""
     loc, var = loc.double(), var.double()
     log_k = math.log(loc.shape[1])
     square = (loc[:, :, None] - loc[:, None]).square()
@@ -52,7 +52,7 @@ def agrees(score: torch.Tensor, expected: torch.Tensor) -> bool:
 
 @pytest.fixture
 def no_kernels_yet() -> Iterator[None]:
-    """As in a process that has not compiled anything, and will forget it."""
+    """Forgets compiled kernels, before the test and after it."""
 
     def forget() -> None:
         mixture_divergence._kernel.cache_clear()
@@ -64,7 +64,7 @@ def no_kernels_yet() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("d", WIDTHS)
-def test_kernel_equals_the_oracle_for_any_rows_and_actions(d: int) -> None:
+def test_kernel_matches_all_pairs_for_any_rows_and_actions(d: int) -> None:
     compiled = counters["stats"]["unique_graphs"]
     for k in (2, 5, 16, 64, 128):
         for spread in (0.0, 0.01, 0.3, 1.0, 5.0, 40.0):
@@ -74,17 +74,17 @@ def test_kernel_equals_the_oracle_for_any_rows_and_actions(d: int) -> None:
                     score = causal_action_influence(
                         loc, var, approximation=approximation, compile=True
                     )
-                    assert agrees(score, oracle(loc, var, approximation))
-    # One kernel at most, unless another test has it already.
+                    assert agrees(score, all_pairs(loc, var, approximation))
+    # At most one kernel; none if another test compiled it.
     assert counters["stats"]["unique_graphs"] <= compiled + 1
 
 
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
-def test_kernel_equals_the_steps(approximation: Any) -> None:
+def test_kernel_matches_the_stepwise_computation(approximation: Any) -> None:
     loc, var = gaussians(50, 33, 3)
     options: dict[str, Any] = {"approximation": approximation}
     slow = causal_action_influence(loc, var, compile=False, **options)
-    # Each limit gives parts of other sizes; the smallest wants less than one row.
+    # Each limit gives parts of other sizes; the smallest is below one row.
     for max_memory in (1, 50_000, 2**28):
         options["max_memory"] = max_memory
         fused = causal_action_influence(loc, var, compile=True, **options)
@@ -111,7 +111,7 @@ def test_kernel_keeps_extreme_numbers_finite_and_in_range() -> None:
                 torch.testing.assert_close(fused, slow, atol=1e-5, rtol=1e-4)
 
 
-def test_entities_of_many_widths_at_once() -> None:
+def test_entities_of_several_widths() -> None:
     widths = [3, 1, 20, 3, 7, 1]  # 20 columns are too many for a kernel
     edges = [sum(widths[:i]) for i in range(len(widths) + 1)]
     slices = [slice(*edges[i : i + 2]) for i in range(len(widths))]
@@ -122,34 +122,34 @@ def test_entities_of_many_widths_at_once() -> None:
         )
         assert scores.shape == (9, 6)
         for i, where in enumerate(slices):
-            expected = oracle(loc[..., where], var[..., where], "bounds")
+            expected = all_pairs(loc[..., where], var[..., where], "bounds")
             assert agrees(scores[:, i], expected)
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 0)])
-def test_what_has_no_kernel_goes_step_by_step(batch: Any) -> None:
+def test_unsupported_input_is_computed_step_by_step(batch: Any) -> None:
     loc, var = gaussians(*batch, 6, 3)
     for case in ((loc, var), (loc.double(), var.double())):
         score = causal_action_influence(*case, compile=True)
         assert torch.equal(score, causal_action_influence(*case, compile=False))
 
 
-def test_many_pairs_are_worth_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
+def test_compiles_the_kernel_for_many_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    requested = []
 
     def kernel(*args: Any) -> None:
-        asked.append(args)
+        requested.append(args)
 
     monkeypatch.setattr(mixture_divergence, "_kernel", kernel)
     monkeypatch.setattr(mixture_divergence, "_LEAST_PAIRS", 10 * 36)
     causal_action_influence(*gaussians(9, 6, 3))
     causal_action_influence(*gaussians(10, 6, 3), compile=False)
-    assert not asked
+    assert not requested
     causal_action_influence(*gaussians(10, 6, 3))
-    assert asked == [(3, "cpu")]
+    assert requested == [(3, "cpu")]
 
 
-def test_without_a_compiler_one_warning_says_so(no_kernels_yet: None) -> None:
+def test_warns_once_without_a_compiler(no_kernels_yet: None) -> None:
     loc, var = gaussians(8, 6, 1)
     with fresh_cache(), config.patch({"cpp.cxx": ("no-such-compiler",)}):
         with pytest.warns(RuntimeWarning, match=r"ten times slower.*C\+\+ compiler"):

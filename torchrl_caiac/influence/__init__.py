@@ -1,9 +1,9 @@
-"""Which entities an action can influence: estimators, and their cached scores."""
+"""Estimators of influence, the scores in a buffer, and the ground truth."""
 
 from __future__ import annotations
 
 from torchrl_caiac.influence.attention import AttentionInfluence
-from torchrl_caiac.influence.cai import CAI, causal_action_influence
+from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.distance import DistanceInfluence
 from torchrl_caiac.influence.mark_unscored import MarkUnscored, set_unscored
 from torchrl_caiac.influence.metrics import (
@@ -12,6 +12,7 @@ from torchrl_caiac.influence.metrics import (
     influence_report,
     roc_auc,
 )
+from torchrl_caiac.influence.mixture_divergence import causal_action_influence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_record import score_file
 from torchrl_caiac.influence.truth import (

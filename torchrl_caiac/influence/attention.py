@@ -1,4 +1,4 @@
-"""The local causal graph that a transformer's attention suggests (CoDA)."""
+"""The local causal graph in the attention of a transformer (CoDA)."""
 
 from __future__ import annotations
 
@@ -9,38 +9,39 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import nn
 
+from torchrl_caiac._keys import get_leaf
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.entity_dynamics_model import evaluating
 from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
 
 __all__ = ["AttentionInfluence"]
 
-_CPU_ROWS = 2**9  # rows through the network at once on a CPU: more leave its cache
+_CPU_ROWS = 2**9  # rows whose activations fit into a CPU's cache
 
 
 class AttentionInfluence(nn.Module):
     r"""Scores influence by the attention of a transformer world model (paper, A.7).
 
-    With :math:`A_l` the attention matrix of layer ``l`` (queries by keys, mean over
-    the heads), the output of token ``j`` attends to the input of token ``i`` by
-    :math:`(A_L \cdots A_1)_{ji}`. That is the score of the edge
-    :math:`s_i \rightarrow s'_j`; the scores of all edges into one entity sum to 1.
+    Let :math:`A_l` be the attention matrix of layer ``l`` (queries by keys, mean over
+    the heads). The output of token ``j`` attends to the input of token ``i`` by
+    :math:`(A_L \cdots A_1)_{ji}`. This is the score of the edge
+    :math:`s_i \rightarrow s'_j`. The scores of all edges into one entity sum to 1.
 
-    :func:`~torchrl_caiac.influence.score_buffer` caches the graphs, which
+    :func:`~torchrl_caiac.influence.score_buffer` stores the graphs, which
     :class:`~torchrl_caiac.transforms.CoDATransform` reads. With ``action_only`` there
-    is one score an entity, that of the edge from the action, which
-    :class:`~torchrl_caiac.transforms.CAIACTransform` reads: CoDA-action.
+    is one score for each entity, that of the edge from the action, which
+    :class:`~torchrl_caiac.transforms.CAIACTransform` reads (CoDA-action).
 
     Args:
         model (TransformerWorldModel): a fitted world model that predicts every entity.
-        action_only (bool): give the action's row alone. Defaults to ``False``.
+        action_only (bool): return only the row of the action. Defaults to ``False``.
 
     Keyword Args:
-        max_memory (int): bytes of working memory above model, data and scores, about;
-            the rows are scored in chunks that fit. Defaults to 256 MiB.
+        max_memory (int): approximate bytes of working memory, without model, data and
+            scores; rows are scored in chunks that fit. Defaults to 256 MiB.
 
     Raises:
-        TypeError: the model has no attention to record.
+        TypeError: the model has no attention.
         ValueError: the model does not predict an entity.
 
     Examples:
@@ -71,7 +72,7 @@ class AttentionInfluence(nn.Module):
         super().__init__()
         if not isinstance(model, TransformerWorldModel):
             raise TypeError(
-                f"a {type(model).__name__} has no attention to record: give a "
+                f"a {type(model).__name__} has no attention: give a "
                 "TransformerWorldModel"
             )
         missing = [n for n in model.layout.names if n not in model.predicted]
@@ -88,40 +89,40 @@ class AttentionInfluence(nn.Module):
 
     @property
     def layout(self) -> EntityLayout:
-        """The entities that are scored: the model's."""
+        """The entities that are scored, those of the model."""
         return self.model.layout
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What is read: the state and the action."""
+        """The keys of the state and the action."""
         return self.model.in_keys
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """The graph's scores; without gradients, in evaluation mode.
+        """Returns the scores of the graph, without gradients.
+
+        The model is in evaluation mode.
 
         Args:
-            tensordict (TensorDictBase): states and actions ``[*B]``; nothing is
-                written.
+            tensordict (TensorDictBase): states and actions ``[*B]``; it is not changed.
 
         Returns:
-            torch.Tensor: float32 ``[*B, N + 1, N]``: from the row (the entities in
-            layout order, then the action) to the column; with ``action_only`` the
-            last row alone, ``[*B, N]``.
+            torch.Tensor: float32 ``[*B, N + 1, N]``, from the row (the entities in
+            layout order, then the action) to the column; with ``action_only`` only the
+            last row, ``[*B, N]``.
 
         Raises:
             KeyError: the action is missing.
-            ValueError: an observation or an action is not finite, or the attention is
-                not.
+            ValueError: an observation, an action or the attention is not finite.
         """
         model, n = self.model, self.layout.num_entities
         state = self.layout.read(tensordict)
-        action = tensordict.get(model.action_key, None)
-        if action is None:
-            raise KeyError(
-                f"attention reads the action {model.action_key!r}, which the data "
-                "lack: name it by the model's action_key"
-            )
+        action = get_leaf(
+            tensordict,
+            model.action_key,
+            "the data lack the action",
+            "name it by action_key of the model",
+        )
         batch = state.shape[:-1]
         state = state.reshape(-1, state.shape[-1])
         action = action.reshape(-1, action.shape[-1])
@@ -143,7 +144,7 @@ class AttentionInfluence(nn.Module):
     def _graph(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         layers = self.model.attention(state, action).float().unbind(-3)
         total = reduce(lambda below, above: above @ below, layers)
-        # From queries by keys to causes by effects; nothing acts on the action.
+        # From queries by keys to causes by effects, without effects on the action.
         return total[:, : self.layout.num_entities].mT
 
     def _check(self, graph: torch.Tensor, first_row: int) -> None:
@@ -159,21 +160,21 @@ class AttentionInfluence(nn.Module):
         ]
         row = int((~finite).flatten(1).any(1).nonzero()[0, 0]) + first_row
         raise ValueError(
-            f"the attention that {names} pay is NaN or infinite, first in row {row}: "
+            f"the attention of {names} is NaN or infinite, first in row {row}: "
             "the model has diverged, or the states are far outside of its data"
         )
 
     @property
     def chunk_rows(self) -> int:
-        """How many rows pass the network at once."""
+        """The number of rows in a chunk."""
         model = self.model
         tokens = self.layout.num_entities + 1
-        # Of a layer's activations, with queries, keys and values; of its attention.
+        # The activations of a layer with queries, keys and values, and its attention.
         per_token = 8 * model.width + 2 * model.feedforward
         per_token += (2 * model.heads + 2 * len(model.layers)) * tokens
         rows = max(1, self.max_memory // (4 * tokens * per_token))
         return min(rows, _CPU_ROWS) if model.device.type == "cpu" else rows
 
     def extra_repr(self) -> str:
-        """The settings, for ``repr``."""
+        """Returns the settings, for ``repr``."""
         return f"action_only={self.action_only}"

@@ -1,4 +1,4 @@
-"""Causal action influence (CAI), section 3.2 and eq. 3 of the paper."""
+"""The estimator of causal action influence (CAI), section 3.2 of the paper."""
 
 from __future__ import annotations
 
@@ -16,126 +16,26 @@ from torchrl.data import Bounded
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.mixture_divergence import (
     Approximation,
+    check_gaussians,
     kernel_pays,
     mixture_influence,
 )
 from torchrl_caiac.modules.entity_dynamics_model import evaluating
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 
-__all__ = ["CAI", "causal_action_influence", "draw_actions"]
+__all__ = ["CAI", "draw_actions"]
 
-_CPU_NETWORK_BYTES = 2**20  # of a layer's activations on a CPU: more leave its cache
-_CPU_GAUSSIAN_BYTES = 2**20  # of the network's means on a CPU, likewise
-_GAUSSIAN_TENSORS = 12  # of the means' size, alive at once
+_CPU_NETWORK_BYTES = 2**20  # activations of a layer that fit into a CPU's cache
+_CPU_GAUSSIAN_BYTES = 2**20  # means of the network that fit into a CPU's cache
+_GAUSSIAN_TENSORS = 12  # tensors of the size of the means at the same time
 
-_FEW_ACTIONS = 16  # of the first look in the fast mode
-_FACTORS = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 16.0)  # from the threshold to what is near
+_FEW_ACTIONS = 16  # for the estimates of the fast mode
+_FACTORS = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 16.0)  # widths of the range around θ
 _SAMPLE = 4096  # states on which the fast mode is checked
-# Above the 99.9 % that are wanted on all states: a sample has an error of its own.
+# The target on all states is 99.9 %; the margin is for the error of the sample.
 _LEAST_AGREEMENT = 0.9995
 
 _logger = logging.getLogger("torchrl_caiac.cai")
-
-
-@torch.no_grad()
-def causal_action_influence(
-    loc: torch.Tensor,
-    var: torch.Tensor,
-    *,
-    approximation: Approximation = "bounds",
-    max_memory: int = 256 * 2**20,
-    compile: bool | None = None,
-) -> torch.Tensor:
-    r"""The influence of the action on one entity, eq. 3 of the paper.
-
-    .. math:: C^j(s) = \frac{1}{K} \sum_{i=1}^{K} D_{KL}\Big(p_i \,\Big\|\,
-        \frac{1}{K} \sum_{k=1}^{K} p_k\Big)
-
-    where :math:`p_i` is the diagonal Gaussian of the entity's next state under action
-    ``i``. The divergence from a mixture has no closed form; following Durrieu, Thiran
-    and Kelly (2012) it is the mean of two approximations,
-
-    .. math:: D_{var} = -\log \frac{1}{K} \sum_k e^{-D_{KL}(p_i \| p_k)}, \qquad
-        D_{prod} = -\log \frac{1}{K} \sum_k \frac{\int p_i p_k}{z_i},
-
-    each clipped below at 0. With ``"bounds"`` :math:`\log z_i` is the negative entropy
-    of :math:`p_i`: :math:`D_{prod}` is then a lower bound of the divergence, as
-    :math:`D_{var}` is always an upper one. This is what Seitzer et al. (2021) and hence
-    the paper's thresholds use, and near the truth where the dependence is smooth.
-    With ``"product"`` :math:`z_i = \int p_i^2`, Durrieu's form for two mixtures, larger
-    by :math:`d (1 - \log 2) / 2` before the clipping: exact where the actions fall
-    into well separated groups, about 1.5 times too high where the dependence is
-    smooth. Both give 0 where the action changes nothing, and at most :math:`\log K`.
-
-    Scores do not change under an affine map of the columns. No gradients.
-
-    Args:
-        loc (torch.Tensor): means under ``K`` actions, ``[*B, K, d]``.
-        var (torch.Tensor): variances, ``[*B, K, d]``.
-
-    Keyword Args:
-        approximation (str): ``"bounds"`` or ``"product"``. Defaults to ``"bounds"``.
-        max_memory (int): bytes of working memory, about. Defaults to 256 MiB.
-        compile (bool, optional): whether to go over the pairs of actions by a compiled
-            kernel, which is about ten times faster, for float32 and ``d`` up to 16; the
-            scores agree up to rounding. Compiling takes some seconds, once for each
-            ``d``. Defaults to ``None``: from :math:`2^{28}` pairs on, ``K * K`` for
-            each mixture.
-
-    Returns:
-        torch.Tensor: nats, ``[*B]`` of the dtype of ``loc``, within [0, log K].
-
-    Raises:
-        ValueError: shapes differ or are empty, a value is not finite, or a variance is
-            not positive.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.influence.cai import causal_action_influence
-        >>> loc = torch.tensor([[[0.0], [0.0]], [[0.0], [100.0]]])
-        >>> causal_action_influence(loc, torch.ones(2, 2, 1))
-        tensor([0.0000, 0.6164])
-    """
-    if loc.shape != var.shape or loc.ndim < 2 or not loc.shape[-1] or not loc.shape[-2]:
-        raise ValueError(
-            "loc and var are both [*B, K, d] with K and d at least 1, got "
-            f"{list(loc.shape)} and {list(var.shape)}"
-        )
-    if approximation not in ("product", "bounds"):
-        raise ValueError(
-            f"approximation is 'bounds' or 'product', got {approximation!r}"
-        )
-    if not loc.is_floating_point() or loc.dtype != var.dtype:
-        raise ValueError(
-            f"loc and var are of one floating dtype, got {loc.dtype} and {var.dtype}"
-        )
-    if max_memory < 1:
-        raise ValueError(f"max_memory is a number of bytes, got {max_memory!r}")
-    _check_gaussians(loc, var)
-    k, d = loc.shape[-2:]
-    scores = mixture_influence(
-        loc.reshape(-1, k, d),
-        var.reshape(-1, k, d),
-        [slice(0, d)],
-        approximation=approximation,
-        max_memory=max_memory,
-        fused=kernel_pays(loc[..., 0].numel() * k) if compile is None else compile,
-    )
-    return scores.reshape(loc.shape[:-2])
-
-
-def _check_gaussians(loc: torch.Tensor, var: torch.Tensor) -> None:
-    if not loc.numel():
-        return
-    # One pass over each, which NaN gets through.
-    if not all(x.isfinite() for x in loc.aminmax()):
-        raise ValueError("loc has NaN or infinite values: the model has diverged")
-    low, high = var.aminmax()
-    if not (low > 0 and high.isfinite()):
-        raise ValueError(
-            "var has values that are not positive and finite: pass variances, with a "
-            "floor above 0"
-        )
 
 
 def draw_actions(
@@ -144,13 +44,14 @@ def draw_actions(
     high: torch.Tensor,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Uniform actions between bounds.
+    """Draws uniform actions between bounds.
 
     Args:
-        num_actions (int): how many, ``K``.
+        num_actions (int): the number of actions, ``K``.
         low (torch.Tensor): lower bounds ``[A]``.
         high (torch.Tensor): upper bounds ``[A]``.
-        generator (torch.Generator, optional): where the numbers come from.
+        generator (torch.Generator, optional): the random number generator. Defaults to
+            that of torch.
 
     Returns:
         torch.Tensor: float32 ``[K, A]``, on the CPU.
@@ -167,23 +68,23 @@ def draw_actions(
 
 
 class CAI(nn.Module):
-    r"""Scores how much the action influences every entity, by a learned model.
+    r"""Scores how much the action influences each entity, by a learned model.
 
-    ``K`` actions are drawn once, uniformly over the action space (paper, A.7), and kept
-    as a buffer: the same ones serve the expectation and the mixture of eq. 3, and
-    every state.
+    ``K`` actions are drawn once, uniformly from the action space (paper, A.7), and kept
+    as a buffer. The same actions serve the expectation and the mixture of eq. 3, and
+    all states.
 
-    The mode ``"fast"`` is for masks at a ``threshold``. Every state gets a first look
-    by 16 of the actions, far from each other. Where an entity that is not fixed is then
-    near the threshold, the state's scores are made exact; the others stay estimates of
-    the same size, at most :math:`\log 16`. Near is from ``threshold / f`` to
-    ``threshold * f``, with the smallest f (from 1.5 to 16) by which 99.95 % of all
-    entities fall on the same side of the threshold as by exact scores; this is found on
-    up to 4,096 states that are spread over the data, before anything is scored. Where
-    no f will do, a warning says so and all scores are exact. :func:`score_buffer` has
-    the whole buffer looked at (:meth:`prepare`), and scores exact up to ``smoothing``
-    times as high, because means are taken; a call of the estimator alone looks at the
-    states that it is given first.
+    The mode ``"fast"`` is for masks at a ``threshold``. It first estimates the scores
+    of each state from 16 of the actions, which are far from each other. If an estimate
+    is near the threshold for an entity that is not fixed, the scores of the state are
+    computed exactly. The other scores remain estimates of at most :math:`\log 16`.
+    "Near" is the range from ``threshold / f`` to ``threshold * f``. The factor ``f``,
+    from 1.5 to 16, is the smallest one with which 99.95 % of all entities are on the
+    same side of the threshold as with exact scores, on up to 4,096 states from all over
+    the data. If no factor suffices, a warning says so and all scores are exact.
+    :func:`~torchrl_caiac.influence.score_buffer` takes these states from the whole
+    buffer (:meth:`prepare`) and multiplies the upper end of the range by ``smoothing``,
+    since it averages scores. A call of the estimator alone takes them from its input.
 
     Args:
         model (GaussianWorldModel): a fitted world model that predicts every entity.
@@ -192,17 +93,19 @@ class CAI(nn.Module):
     Keyword Args:
         action_spec (Bounded, optional): the action space, ``[A]``. Defaults to [-1, 1]
             in every dimension.
-        seed (int): of the draw of the actions. Defaults to 0.
-        generator (torch.Generator, optional): draw with this instead of ``seed``.
-        approximation (str): as in :func:`causal_action_influence`. Defaults to
+        seed (int): the seed of the actions. Defaults to 0.
+        generator (torch.Generator, optional): draws the actions instead of ``seed``.
+        approximation (str): as in
+            :func:`~torchrl_caiac.influence.causal_action_influence`. Defaults to
             ``"bounds"``.
-        max_memory (int): bytes of working memory above model, data and scores, about;
-            the rows are scored in chunks that fit. Defaults to 256 MiB.
+        max_memory (int): approximate bytes of working memory, without model, data and
+            scores; rows are scored in chunks that fit. Defaults to 256 MiB.
         mode (str): ``"exact"`` or ``"fast"``. Defaults to ``"exact"``.
         threshold (float, optional): the threshold :math:`\theta` that scores will be
-            compared with; needed by the fast mode only.
-        compile (bool, optional): as in :func:`causal_action_influence`. Defaults to
-            ``None``: where enough states are to be scored, about 20,000 for three
+            compared with; the fast mode needs it.
+        compile (bool, optional): as in
+            :func:`~torchrl_caiac.influence.causal_action_influence`. Defaults to
+            ``None``: compile if there are enough states, about 20,000 for three
             entities and 64 actions.
 
     Attributes:
@@ -210,8 +113,8 @@ class CAI(nn.Module):
 
     Raises:
         ValueError: the model does not predict an entity; the action spec has another
-            size or no finite bounds; ``num_actions`` is below 2; the fast mode has no
-            positive threshold, or 16 actions or fewer.
+            size or infinite bounds; ``num_actions`` is below 2; the fast mode has no
+            positive threshold, or at most 16 actions.
         TypeError: the model is not Gaussian, or the action spec is not bounded.
 
     Examples:
@@ -263,7 +166,7 @@ class CAI(nn.Module):
             )
         if mode == "fast" and num_actions <= _FEW_ACTIONS:
             raise ValueError(
-                f"the fast mode first looks at {_FEW_ACTIONS} of more actions, got "
+                f"the fast mode needs more than {_FEW_ACTIONS} actions, got "
                 f"num_actions={num_actions}: use mode='exact'"
             )
         if not isinstance(model, GaussianWorldModel):
@@ -289,33 +192,35 @@ class CAI(nn.Module):
         self.compile_kernel = compile
         self.register_buffer("actions", draw_actions(num_actions, low, high, generator))
         self.actions = self.actions.to(model.loc_head.weight.device)
-        self._many = False  # states to score: worth a compiled kernel
-        # In the fast mode, the scores that are made exact; None: all.
+        self._many = False  # whether there are enough states to compile the kernel
+        # The range of estimates that the fast mode replaces by exact scores; None: all.
         self._near: tuple[float, float] | None = None
         self._is_ready = mode == "exact"
 
     @property
     def layout(self) -> EntityLayout:
-        """The entities that are scored: the model's."""
+        """The entities that are scored, those of the model."""
         return self.model.layout
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """The influence on every entity; without gradients, in evaluation mode.
+        """Returns the influence on each entity, without gradients.
+
+        The model is in evaluation mode.
 
         Args:
             tensordict (TensorDictBase): states ``[*B]``, with the keys of the layout;
-                nothing is written.
+                it is not changed.
 
         Returns:
-            torch.Tensor: float32 ``[*B, N]``, nats, entities in layout order.
+            torch.Tensor: float32 ``[*B, N]``, in nats, entities in layout order.
 
         Raises:
-            ValueError: an observation is not finite, or the model's output is not.
+            ValueError: an observation or an output of the model is not finite.
         """
         states = self._flat(tensordict)
         if not self._is_ready and len(states):
-            self._look_around(states, smoothing=1)
+            self._find_range(states, smoothing=1)
         scores = self._score(states, self._near)
         return scores.reshape(*tensordict.batch_size, scores.shape[-1])
 
@@ -323,27 +228,27 @@ class CAI(nn.Module):
     def prepare(
         self, tensordict: TensorDictBase, num_states: int, *, smoothing: int = 1
     ) -> None:
-        """Gets ready to score many states, of which some are given.
+        """Prepares to score many states.
 
-        It decides whether compiling pays and, in the fast mode, which scores have to be
-        exact. :func:`score_buffer` calls it before it scores. Call it again when the
-        model has changed.
+        It decides whether to compile the kernel and, in the fast mode, which scores
+        have to be exact. :func:`~torchrl_caiac.influence.score_buffer` calls it before
+        it scores. Call it again if the model has changed.
 
         Args:
-            tensordict (TensorDictBase): states ``[*B]``, spread over all; those that
-                are not finite are passed over.
-            num_states (int): how many will be scored.
+            tensordict (TensorDictBase): a sample of the states, ``[*B]``; states that
+                are not finite are ignored.
+            num_states (int): the number of states to score.
 
         Keyword Args:
-            smoothing (int): the states that a mean is taken over before scores are
-                compared with the threshold. Defaults to 1.
+            smoothing (int): the number of states whose scores will be averaged before
+                they are compared with the threshold. Defaults to 1.
         """
         self._many = self._kernel_pays(num_states)
         if self.mode == "fast":
             states = self._flat(tensordict)
             finite = self.layout.read(states).isfinite().all(-1)
             if bool(finite.any()):
-                self._look_around(states[finite], smoothing)
+                self._find_range(states[finite], smoothing)
 
     def _flat(self, tensordict: TensorDictBase) -> TensorDictBase:
         states = tensordict.select(*self.layout.in_keys, strict=False)
@@ -355,7 +260,7 @@ class CAI(nn.Module):
     def _score(
         self, states: TensorDictBase, near: tuple[float, float] | None
     ) -> torch.Tensor:
-        """Scores ``[n, N]`` of states ``[n]``, exact in some range or (None) all."""
+        """Scores ``[n, N]`` of states ``[n]``, exact within a range (``None``: all)."""
         device = self.layout.read(states[:1]).device
         scores = torch.empty(len(states), self.layout.num_entities, device=device)
         fused = self.compile_kernel
@@ -391,9 +296,10 @@ class CAI(nn.Module):
     def _network(
         self, actions: list[int]
     ) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
-        """The model's predictions under some of the actions."""
+        """A function that predicts Gaussians under some of the actions."""
         model = self.model
-        # A quarter of the memory: two layers' activations and both heads' outputs.
+        # A quarter of the memory, for the activations of two layers and the outputs of
+        # both heads.
         most = self.max_memory // 4 // 3
         if self.actions.device.type == "cpu":
             most = min(most, _CPU_NETWORK_BYTES)
@@ -402,7 +308,7 @@ class CAI(nn.Module):
         return model.for_actions(self.actions[actions], rows=rows)
 
     def _states_at_once(self, num_actions: int) -> int:
-        """How many states' Gaussians are worked on at once."""
+        """The number of states whose Gaussians fit into the memory."""
         most = self.max_memory // 4 // _GAUSSIAN_TENSORS
         if self.actions.device.type == "cpu":
             most = min(most, _CPU_GAUSSIAN_BYTES)
@@ -413,7 +319,7 @@ class CAI(nn.Module):
         self, loc: torch.Tensor, var: torch.Tensor, fused: bool
     ) -> torch.Tensor:
         """Scores ``[b, N]`` from Gaussians ``[b, K, P]``."""
-        _check_gaussians(loc, var)
+        check_gaussians(loc, var)
         scores = mixture_influence(
             loc,
             var,
@@ -427,13 +333,13 @@ class CAI(nn.Module):
     def _any_within(
         self, scores: torch.Tensor, near: tuple[float, float]
     ) -> torch.Tensor:
-        """Whether an entity that may be swapped has a score in a range, ``[n]``."""
+        """Whether an entity that is not fixed has a score in the range, ``[n]``."""
         names, fixed = self.layout.names, self.layout.fixed
         free = [i for i, name in enumerate(names) if name not in fixed]
         return ((scores > near[0]) & (scores < near[1]))[:, free].any(-1)
 
-    def _look_around(self, states: TensorDictBase, smoothing: int) -> None:
-        """Sets the range of scores that the fast mode makes exact, or that all are."""
+    def _find_range(self, states: TensorDictBase, smoothing: int) -> None:
+        """Finds the range of estimates that the fast mode replaces by exact scores."""
         threshold = self.threshold or math.nan
         if len(states) > _SAMPLE:
             rows = torch.linspace(0, len(states) - 1, _SAMPLE, dtype=torch.float64)
@@ -451,22 +357,22 @@ class CAI(nn.Module):
         if agreement >= _LEAST_AGREEMENT:
             self._near = near
             _logger.info(
-                "fast mode: states with scores from %.3g to %.3g, %.0f %% of a sample, "
-                "get exact ones; masks agree on %.3f %%",
+                "fast mode: scores from %.3g to %.3g, in %.0f %% of the sample, are "
+                "computed exactly; %.3f %% of the masks agree",
                 *(*near, 100 * unsure.double().mean().item(), 100 * agreement),
             )
             return
         self._near = None
         warnings.warn(
             f"the fast mode cannot be used: masks at the threshold {threshold:g} agree "
-            f"with the exact ones on {agreement:.2%} of a sample, wanted "
-            f"{_LEAST_AGREEMENT:.2%}. All scores are made exact, which is slower",
+            f"with the exact ones on {agreement:.2%} of a sample, expected "
+            f"{_LEAST_AGREEMENT:.2%}. All scores are computed exactly, which is slower",
             RuntimeWarning,
             stacklevel=3,
         )
 
     def extra_repr(self) -> str:
-        """The settings, for ``repr``."""
+        """Returns the settings, for ``repr``."""
         text = f"num_actions={self.num_actions}, approximation={self.approximation!r}"
         if self.mode == "fast":
             text += f", mode='fast', threshold={self.threshold:g}"
@@ -474,7 +380,7 @@ class CAI(nn.Module):
 
 
 def _spread(actions: torch.Tensor, count: int) -> list[int]:
-    """Some of the actions ``[K, A]``, each as far from those before it as can be."""
+    """Some of the actions ``[K, A]``, each as far as possible from those before it."""
     unit = actions / actions.std(0).clamp_min(1e-9)
     distance = (unit - unit.mean(0)).norm(dim=-1)
     chosen = [int(distance.argmax())]

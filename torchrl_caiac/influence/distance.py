@@ -1,4 +1,4 @@
-"""Influence by distance: what is far apart is independent."""
+"""Influence by distance: entities that are far apart are independent."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ __all__ = ["DistanceInfluence"]
 
 
 class DistanceInfluence(nn.Module):
-    """Calls entities linked that are close, and acted on that are close to the agent.
+    """Links entities that are close, and the action to entities close to the agent.
 
-    The hand-made rule that CoDA used online ("objects are disentangled if more than
-    10 cm apart", paper A.3.1): no model, and the user's knowledge in its place. The
-    scores are 1 or 0, to be used with any threshold between; the graphs are for
-    :class:`~torchrl_caiac.transforms.CoDATransform`, the action's row alone for
+    This is the rule that CoDA used online ("objects are disentangled if more than
+    10 cm apart", paper A.3.1). It needs no model but knowledge of the positions. The
+    scores are 1 or 0, for any threshold in between. The graphs are for
+    :class:`~torchrl_caiac.transforms.CoDATransform`, the row of the action for
     :class:`~torchrl_caiac.transforms.CAIACTransform`.
 
     Args:
         layout (EntityLayout): the entities.
-        positions (mapping of str to iterable of int): the columns that hold each
-            entity's position, the same number for all, in one order and unit. Flat
-            layouts: observation columns that the entity owns. Nested layouts:
-            positions in the entity's flattened features.
+        positions (mapping of str to iterable of int): the columns of each entity's
+            position, the same number for all, in the same order and unit. In flat
+            layouts these are observation columns of the entity, in nested layouts
+            places in the entity's flattened features.
         agent (str, optional): the entity that the action moves. Defaults to the
             layout's only ``fixed`` one.
         distance (float): the largest distance of linked entities, in the unit of the
             positions. Defaults to 0.1 (10 cm).
 
     Keyword Args:
-        action_only (bool): give the action's row alone. Defaults to ``False``.
+        action_only (bool): return only the row of the action. Defaults to ``False``.
 
     Raises:
-        ValueError: positions are missing or of several sizes, or are not the entity's;
+        ValueError: positions are missing, differ in size or belong to another entity;
             the agent is unknown; the distance is not positive.
 
     Examples:
@@ -70,14 +70,14 @@ class DistanceInfluence(nn.Module):
         self.positions = {name: tuple(columns) for name, columns in positions.items()}
         if set(self.positions) != set(layout.names):
             raise ValueError(
-                f"positions name {sorted(self.positions)}, wanted all entities "
-                f"{list(layout.names)}: give the columns of each one's position"
+                f"positions name {sorted(self.positions)}, expected all entities "
+                f"{list(layout.names)}: give the columns of each position"
             )
         sizes = {name: len(columns) for name, columns in self.positions.items()}
         if len(set(sizes.values())) != 1 or not min(sizes.values()):
             raise ValueError(
-                f"the positions have {sizes} columns, wanted the same number for all, "
-                "at least 1"
+                f"the positions have {sizes} columns, expected the same number, at "
+                "least 1, for all"
             )
         for name, columns in self.positions.items():
             own = layout.columns[name] if layout.is_flat else None
@@ -85,7 +85,7 @@ class DistanceInfluence(nn.Module):
             if foreign:
                 raise ValueError(
                     f"positions give entity {name!r} the columns {foreign}, which it "
-                    "does not own: name columns of its own"
+                    "does not have: give columns of the entity"
                 )
         if agent is None:
             if len(layout.fixed) != 1:
@@ -107,20 +107,20 @@ class DistanceInfluence(nn.Module):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What is read: the state alone."""
+        """The keys of the state."""
         return self.layout.in_keys
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """The graph of every state.
+        """Returns the graph of each state.
 
         Args:
-            tensordict (TensorDictBase): states ``[*B]``; nothing is written.
+            tensordict (TensorDictBase): states ``[*B]``; it is not changed.
 
         Returns:
             torch.Tensor: float32 ``[*B, N + 1, N]``, 1 where the row (the entities in
             layout order, then the action) is linked to the column, else 0; with
-            ``action_only`` the last row alone, ``[*B, N]``.
+            ``action_only`` only the last row, ``[*B, N]``.
 
         Raises:
             ValueError: a position is not finite, or the state has too few columns.
@@ -162,7 +162,7 @@ class DistanceInfluence(nn.Module):
         return place
 
     def extra_repr(self) -> str:
-        """The settings, for ``repr``."""
+        """Returns the settings, for ``repr``."""
         return (
             f"positions={self.positions}, agent={self.agent!r}, "
             f"distance={self.distance}, action_only={self.action_only}"
