@@ -43,7 +43,7 @@ def rows(count: int = 60) -> TensorDict:
 
 
 class Observed:
-    """The observation itself as scores; as graphs, in the action's row."""
+    """Scores that are the observation; in graphs, the row of the action."""
 
     def __init__(self, graph: bool = False) -> None:
         self.layout, self.graph = LAYOUT, graph
@@ -82,7 +82,7 @@ def every_draw(scores, truth, transform, batches=60):
     ratio=st.sampled_from([0.25, 1.0]),
     seed=st.integers(0, 9),
 )
-def test_shares_are_those_of_the_single_draws(threshold, ratio, seed):
+def test_shares_match_single_draws(threshold, ratio, seed):
     generator = torch.Generator().manual_seed(seed)
     scores = torch.rand(50, 3, generator=generator)
     truth = torch.rand(50, 3, generator=generator) < 0.3
@@ -99,7 +99,7 @@ def test_shares_are_those_of_the_single_draws(threshold, ratio, seed):
         assert math.isnan(found.infeasible_total)
 
 
-def test_the_truth_swaps_nothing_infeasible_and_its_opposite_nothing_else():
+def test_all_swaps_are_feasible_by_ground_truth_and_none_by_its_opposite():
     truth = torch.rand(200, 3) < 0.5
     truth[:, 0] = True
     transform = CAIACTransform(LAYOUT, 0.5, counterfactual_ratio=1.0)
@@ -107,7 +107,7 @@ def test_the_truth_swaps_nothing_infeasible_and_its_opposite_nothing_else():
     assert swap_shares(transform, 1 - truth.float(), truth).infeasible_total == 1
 
 
-def test_components_are_judged_entity_by_entity():
+def test_components_are_compared_entity_by_entity():
     graph = torch.zeros(100, 4, 3)
     graph[:, 1, 2] = 1.0  # cup and box are one component
     truth = torch.zeros(100, 3, dtype=torch.bool)
@@ -124,16 +124,16 @@ def test_components_are_judged_entity_by_entity():
     [
         (CAIACTransform(LAYOUT, window=2), (8, 3), "windows of 2 rows"),
         (CAIACTransform(LAYOUT, donors=LazyTensorStorage(3)), (8, 3), "donor"),
-        (CAIACTransform(LAYOUT), (8, 4, 3), r"\[8, 4, 3\].*wanted \[8, 3\]"),
-        (CoDATransform(LAYOUT), (8, 3), r"wanted \[8, 4, 3\]"),
+        (CAIACTransform(LAYOUT), (8, 4, 3), r"\[8, 4, 3\].*expected \[8, 3\]"),
+        (CoDATransform(LAYOUT), (8, 3), r"expected \[8, 4, 3\]"),
     ],
 )
-def test_what_does_not_fit_is_refused(transform, shape, message):
+def test_rejects_transforms_and_shapes_that_do_not_fit(transform, shape, message):
     with pytest.raises(ValueError, match=message):
         swap_shares(transform, torch.zeros(shape), torch.zeros(8, 3).bool())
 
 
-def test_estimators_are_compared_on_the_same_rows():
+def test_table_of_several_estimators():
     data = rows()
     before = data.clone()
     truth = data["observation"] > 0.5
@@ -165,7 +165,7 @@ def test_estimators_are_compared_on_the_same_rows():
     assert math.isnan(by_name["smooth", "all"]["fit_seconds"])
     graph = by_name["graph", "all"]
     assert graph["auc"] == 1
-    # Of nine links that are not to oneself only the action's are ever there.
+    # Of the nine links between different nodes, only those of the action exist.
     everything = (data["observation"] > 0.5).float().mean().item()
     assert graph["density"] == pytest.approx(everything / 3)
 

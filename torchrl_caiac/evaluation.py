@@ -1,4 +1,4 @@
-"""Comparing influence estimators by what is swapped because of them."""
+"""Evaluation of influence estimators by ground truth and by the swaps that follow."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_caiac._files import whole_file
 from torchrl_caiac.data.offline_buffer import offline_buffer
-from torchrl_caiac.experiments import update_csv, whole_file
+from torchrl_caiac.experiments import update_csv
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.metrics import influence_report
 from torchrl_caiac.influence.score_buffer import score_buffer
@@ -36,13 +37,13 @@ __all__ = [
     "swap_shares",
 ]
 
-_JUDGED = ("auc", "true_positive_rate", "false_positive_rate", "best_threshold")
-#: What :func:`compare_influence` reports, in the order of the published table.
+_RATES = ("auc", "true_positive_rate", "false_positive_rate", "best_threshold")
+#: The columns of the table that :func:`compare_influence` returns.
 COLUMNS = (
     "estimator",
     "entity",
     "threshold",
-    *_JUDGED,
+    *_RATES,
     "infeasible",
     "density",
     "rows_swapped",
@@ -52,16 +53,16 @@ COLUMNS = (
 
 
 class Candidate(NamedTuple):
-    """An estimator, and the transform that would read its scores.
+    """An estimator and a transform that reads its scores.
 
     Attributes:
-        estimator: as :func:`~torchrl_caiac.influence.score_buffer` takes it; of the
-            action's influence ``[n, N]``, or of graphs ``[n, N + 1, N]``.
+        estimator: as in :func:`~torchrl_caiac.influence.score_buffer`; its scores are
+            the influence of the action, ``[n, N]``, or graphs, ``[n, N + 1, N]``.
         transform: a :class:`~torchrl_caiac.CAIACTransform` or a
-            :class:`~torchrl_caiac.CoDATransform` of one-row windows with donors in the
-            batch. Its threshold is θ; its keys do not matter.
+            :class:`~torchrl_caiac.CoDATransform` with single-row windows and donors in
+            the batch. Its threshold is θ; its keys do not matter.
         smoothing: as in :func:`~torchrl_caiac.influence.score_buffer`.
-        fit_seconds: what fitting took, to be reported; NaN where it is not known.
+        fit_seconds: the time that fitting took, which is reported; NaN if unknown.
     """
 
     estimator: Callable[[TensorDictBase], torch.Tensor]
@@ -145,13 +146,14 @@ def paper_candidates(
 
 
 class SwapShares(NamedTuple):
-    """What was swapped, and how much of it cannot have happened.
+    """How many swaps there are, and how many of them are infeasible.
 
     Attributes:
-        rows: the share of counterfactual rows in which something is swapped.
-        infeasible: the share of swaps whose entity the action did move, in its own row
-            or in the donor's; float64 ``[N]``, NaN where an entity is never swapped.
-        infeasible_total: the same over all entities.
+        rows: the share of counterfactual rows in which an entity is swapped.
+        infeasible: the share of the swaps of each entity in which the action influences
+            it in its own row or in the donor's; float64 ``[N]``, NaN for an entity that
+            is never swapped.
+        infeasible_total: the same share over all entities.
     """
 
     rows: float
@@ -168,26 +170,29 @@ def swap_shares(
     batches: int = 200,
     seed: int = 0,
 ) -> SwapShares:
-    """Judges the swaps of a transform by the true influence.
+    """Compares the swaps of a transform with the ground truth.
 
-    A swap is infeasible where the truth says that the action controlled the swapped
-    entity: what it did there belongs to the action, which is not swapped.
+    A swap is infeasible if, by the ground truth, the action influences the swapped
+    entity: its motion then belongs to the action, which is not swapped.
 
     Args:
-        transform (CounterfactualTransform): of one-row windows, donors in the batch.
-        scores (torch.Tensor): what the transform reads, ``[T, *feature_shape]``.
-        influenced (torch.Tensor): the truth, bool ``[T, N]``.
+        transform (CounterfactualTransform): a transform with single-row windows and
+            donors in the batch.
+        scores (torch.Tensor): the scores that the transform reads,
+            ``[T, *feature_shape]``.
+        influenced (torch.Tensor): the ground truth, bool ``[T, N]``.
 
     Keyword Args:
-        batch_size (int): rows a batch. Defaults to 512.
-        batches (int): how many are drawn. Defaults to 200.
-        seed (int): of the draws. Defaults to 0.
+        batch_size (int): the number of rows in a batch. Defaults to 512.
+        batches (int): the number of batches. Defaults to 200.
+        seed (int): the seed of the draws. Defaults to 0.
 
     Returns:
         SwapShares: the shares.
 
     Raises:
-        ValueError: the transform has windows or a donor buffer; shapes do not fit.
+        ValueError: the transform has longer windows or a donor buffer, or the shapes do
+            not fit.
 
     Examples:
         >>> import torch
@@ -201,32 +206,33 @@ def swap_shares(
     if transform.window != 1 or transform.donors is not None:
         raise ValueError(
             f"the transform has windows of {transform.window} rows and donors "
-            f"{transform.donors!r}: give one of single rows with donors in the batch"
+            f"{transform.donors!r}: give one with window=1 and donors=None"
         )
-    wanted = (len(influenced), *transform.feature_shape)
-    if tuple(scores.shape) != wanted or influenced.shape[1:] != wanted[-1:]:
+    expected = (len(influenced), *transform.feature_shape)
+    if tuple(scores.shape) != expected or influenced.shape[1:] != expected[-1:]:
         raise ValueError(
-            f"scores and influenced have shapes {list(scores.shape)} and "
-            f"{list(influenced.shape)}, wanted {list(wanted)} and [T, {wanted[-1]}]"
+            f"scores and influenced have the shapes {list(scores.shape)} and "
+            f"{list(influenced.shape)}, expected {list(expected)} and "
+            f"[T, {expected[-1]}]"
         )
     generator = torch.Generator().manual_seed(seed)
     rows = total = 0
-    swaps = torch.zeros(wanted[-1], dtype=torch.int64)
-    bad = torch.zeros(wanted[-1], dtype=torch.int64)
+    swaps = torch.zeros(expected[-1], dtype=torch.int64)
+    infeasible = torch.zeros(expected[-1], dtype=torch.int64)
     for _ in range(batches):
         choice = torch.randint(len(scores), (batch_size,), generator=generator)
         draw = transform.generate_parameters(scores[choice], generator)
         truth = influenced[choice]
         own = truth[batch_size - len(draw.swapped) :]
-        given = truth.gather(0, draw.donors.where(draw.swapped, 0))
+        donors = truth.gather(0, draw.donors.where(draw.swapped, 0))
         rows += int(draw.swapped.any(-1).sum())
         total += len(draw.swapped)
         swaps += draw.swapped.sum(0)
-        bad += (draw.swapped & (own | given)).sum(0)
+        infeasible += (draw.swapped & (own | donors)).sum(0)
     return SwapShares(
         rows / total if total else math.nan,
-        bad.double() / swaps,
-        (bad.sum().double() / swaps.sum()).item(),
+        infeasible.double() / swaps,
+        (infeasible.sum().double() / swaps.sum()).item(),
     )
 
 
@@ -239,30 +245,33 @@ def compare_influence(
     seed: int = 0,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Compares estimators on the same rows, by the truth.
+    """Compares estimators with the ground truth, all on the same rows.
 
     Args:
-        data (TensorDictBase): transitions ``[T]`` of whole trajectories, with what the
-            estimators read; they stay as they are.
-        influenced (torch.Tensor): the truth about each row's state, bool ``[T, N]``,
-            of :func:`~torchrl_caiac.influence.true_influence`.
+        data (TensorDictBase): transitions ``[T]`` of whole trajectories, with the keys
+            that the estimators read; they are not changed.
+        influenced (torch.Tensor): the ground truth for the state of each row, bool
+            ``[T, N]``, see :func:`~torchrl_caiac.influence.true_influence`.
         candidates (mapping of str to Candidate): the estimators by name.
 
     Keyword Args:
-        batch_size (int): states scored at once. Defaults to 4096.
-        seed (int): of the swaps that are tried. Defaults to 0.
+        batch_size (int): the number of states scored at once. Defaults to 4096.
+        seed (int): the seed of the swaps. Defaults to 0.
         progress (bool): show progress bars. Defaults to ``True``.
 
     Returns:
-        list of dict: for each estimator one with ``"entity": "all"``, and one for each
-        entity that may be swapped. All have ``"estimator"``; ``"threshold"``, θ;
-        ``"auc"``, ``"true_positive_rate"``, ``"false_positive_rate"`` and
-        ``"best_threshold"`` of the action's influence
-        (:func:`~torchrl_caiac.influence.influence_report`; for all, the mean over
-        entities that have an AUC); and ``"infeasible"``, the share of
-        swaps (:func:`swap_shares`). For all, also ``"density"``, the share of links
-        above θ among those that the estimator scores; ``"rows_swapped"``;
-        ``"fit_seconds"``; and ``"score_seconds"``, processor time for all rows.
+        list of dict: for each estimator one row with ``"entity": "all"`` and one for
+        each entity that is not fixed, in the columns :data:`COLUMNS`:
+
+        - ``"estimator"`` and ``"threshold"``, θ;
+        - ``"auc"``, ``"true_positive_rate"``, ``"false_positive_rate"`` and
+          ``"best_threshold"`` of the influence of the action, see
+          :class:`~torchrl_caiac.influence.EntityReport`; for all entities, the mean
+          over those that have an AUC;
+        - ``"infeasible"``, the share of infeasible swaps, see :func:`swap_shares`;
+        - for all entities only: ``"density"``, the share of scored links above θ;
+          ``"rows_swapped"``; ``"fit_seconds"``; and ``"score_seconds"``, the processor
+          time for all rows.
 
     Examples:
         >>> import torch
@@ -315,20 +324,20 @@ def compare_influence(
             {
                 **common,
                 "entity": entity,
-                **{key: report[entity][key] for key in _JUDGED},
+                **{key: report[entity][key] for key in _RATES},
                 "infeasible": swaps.infeasible[layout.index(entity)].item(),
             }
             for entity in layout.names
             if entity not in layout.fixed
         ]
-        judged = [row for row in entities if not math.isnan(row["auc"])]
+        with_auc = [row for row in entities if not math.isnan(row["auc"])]
         rows.append(
             {
                 **common,
                 "entity": "all",
                 **{
-                    key: fmean(row[key] for row in judged) if judged else math.nan
-                    for key in _JUDGED
+                    key: fmean(row[key] for row in with_auc) if with_auc else math.nan
+                    for key in _RATES
                 },
                 "infeasible": swaps.infeasible_total,
                 "density": _density(scores, layout.fixed_mask, theta),
@@ -414,15 +423,15 @@ def _number(value: float | None) -> str:
 
 
 def _cpu_seconds() -> float:
-    """Processor time of this process and of its children that have ended."""
+    """The processor time of this process and of its children that have ended."""
     return time.process_time() + sum(os.times()[2:4])
 
 
 def _density(scores: torch.Tensor, fixed: torch.Tensor, threshold: float) -> float:
-    """The share of scored links that are there."""
-    if scores.ndim == 2:  # the action always moves what is fixed
+    """The share of scored links above the threshold."""
+    if scores.ndim == 2:  # without fixed entities, which the action always influences
         scored = (~fixed).expand_as(scores)
-    else:  # nor is an entity's link to itself one
+    else:  # without the links from an entity to itself
         n = scores.shape[-1]
         scored = (~torch.eye(n + 1, n, dtype=torch.bool)).expand_as(scores)
     return (scores[scored] > threshold).double().mean().item()
