@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 
+from torchrl_caiac._layout_reading import check_width
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.lmp import Standardize, _moments
 
@@ -240,7 +241,7 @@ class GoalFeatures(TensorDictModuleBase):
 
     def _join(self, observation: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
         layout = self.layout
-        layout._check_width(observation.shape[-1], self.observation_key)
+        check_width(layout, observation.shape[-1], self.observation_key)
         if goal.shape[-1] != layout.goal_width:
             raise ValueError(
                 f"{self.desired_goal_key!r} has {goal.shape[-1]} columns, but the "

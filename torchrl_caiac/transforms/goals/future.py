@@ -156,9 +156,9 @@ class FutureGoal(Transform, SampleUnit):
         self.keys = keys or TransformKeys()
         if layout.is_flat and layout.achieved:
             key: NestedKey = layout.next(layout.observation_key)
-            self._goal_columns = key, _mirrored_columns(layout)
+            self._goal_columns = key, layout.goal_columns()
         elif layout.is_flat:
-            columns = list(range(layout.goal_width))
+            columns = tuple(range(layout.goal_width))
             self._goal_columns = layout.next(layout.achieved_goal_key), columns
         self._reset_state()
 
@@ -168,7 +168,6 @@ class FutureGoal(Transform, SampleUnit):
         self._cache = TrajectoryCache(
             trajectory_key=self.keys.trajectory, done_key=self.keys.done
         )
-        self._columns: dict[torch.device, torch.Tensor] = {}
 
     @property
     def goal_keys(self) -> list[NestedKey]:
@@ -236,10 +235,7 @@ class FutureGoal(Transform, SampleUnit):
                 f"but the layout's goals need [T, D] with at least {max(columns) + 1}: "
                 "correct the layout, or the data"
             )
-        where = self._columns.get(source.device)
-        if where is None:
-            where = torch.tensor(columns, device=source.device)
-            self._columns[source.device] = where
+        where = self.layout.index_tensor(("goal", key), columns, source.device)
         return plain_tensor(source), where
 
     def nested_source(self, data: TensorDictBase, name: str) -> Any:
@@ -319,19 +315,9 @@ class FutureGoal(Transform, SampleUnit):
 
     def __getstate__(self) -> dict[str, Any]:
         state: dict[str, Any] = super().__getstate__()
-        del state["_pending"], state["_cache"], state["_columns"]
+        del state["_pending"], state["_cache"]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._reset_state()
-
-
-def _mirrored_columns(layout: EntityLayout) -> list[int]:
-    """The observation column that each goal column of a flat layout mirrors."""
-    mirrored = {
-        goal: observed
-        for name, columns in layout.goal.items()
-        for goal, observed in zip(columns, layout.achieved[name], strict=True)
-    }
-    return [mirrored[column] for column in range(layout.goal_width)]

@@ -1,0 +1,145 @@
+"""The JSON form and the text form of an entity layout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from torchrl_caiac._columns import column_ranges
+from torchrl_caiac._keys import jsonable, key_from_json
+
+if TYPE_CHECKING:
+    from torchrl_caiac.entities import EntityLayout
+
+__all__ = ["layout_arguments", "layout_text", "layout_to_dict"]
+
+_FORMAT = "torchrl_caiac.EntityLayout"
+_VERSION = 1
+# The keys that only flat layouts have.
+_FLAT_KEYS = ("observation_key", "desired_goal_key", "achieved_goal_key")
+
+
+def layout_to_dict(layout: EntityLayout) -> dict[str, Any]:
+    """Returns a layout as JSON-compatible values.
+
+    Args:
+        layout (EntityLayout): the layout.
+
+    Returns:
+        dict: the input of :func:`layout_arguments`.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac._layout_format import layout_to_dict
+        >>> layout_to_dict(EntityLayout({"arm": [0, 1]}))["entities"]
+        [['arm', [0, 1]]]
+    """
+    entities: Mapping[str, Any] = layout.columns if layout.is_flat else layout.keys
+
+    # Pairs, because the order of the entities is part of the layout.
+    def pairs(named: Mapping[str, Any]) -> list[Any]:
+        return [[name, jsonable(value)] for name, value in named.items()]
+
+    content: dict[str, Any] = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "entities": pairs(entities),
+        "flat": layout.is_flat,
+        "goal": pairs(layout.goal),
+        "achieved": pairs(layout.achieved),
+        "fixed": list(layout.fixed),
+        "next_key": jsonable(layout.next_key),
+    }
+    if layout.is_flat:
+        content |= {key: jsonable(getattr(layout, key)) for key in _FLAT_KEYS}
+    return content
+
+
+def layout_arguments(content: Any) -> tuple[bool, dict[str, Any]]:
+    """Returns the arguments of the layout that :func:`layout_to_dict` described.
+
+    Args:
+        content (Any): the result of :func:`layout_to_dict`.
+
+    Returns:
+        tuple of bool and dict: whether the layout is flat, and the arguments of
+        ``EntityLayout`` or ``EntityLayout.from_keys``.
+
+    Raises:
+        KeyError: an entry is missing.
+        TypeError: an entry has another type.
+        ValueError: the content does not describe a layout, or has another version.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac._layout_format import layout_arguments
+        >>> content = EntityLayout({"arm": [0, 1]}).to_dict()
+        >>> layout_arguments(content)[1]["entities"]
+        {'arm': (0, 1)}
+    """
+    if not isinstance(content, Mapping) or content.get("format") != _FORMAT:
+        raise ValueError(
+            "the content does not describe an EntityLayout: expected a mapping with "
+            f"'format': {_FORMAT!r}"
+        )
+    if content.get("version") != _VERSION:
+        raise ValueError(
+            f"the layout has version {content.get('version')!r}, expected {_VERSION}: "
+            "update torchrl_caiac"
+        )
+    named = {
+        part: {name: key_from_json(value) for name, value in content[part]}
+        for part in ("entities", "goal", "achieved")
+    }
+    arguments: dict[str, Any] = {
+        "entities": named["entities"],
+        "goal": named["goal"] or None,
+        "achieved": named["achieved"] or None,
+        "fixed": content["fixed"],
+        "next_key": key_from_json(content["next_key"]),
+    }
+    is_flat = bool(content["flat"])
+    if is_flat:
+        arguments |= {key: key_from_json(content[key]) for key in _FLAT_KEYS}
+    return is_flat, arguments
+
+
+def layout_text(layout: EntityLayout) -> str:
+    """Returns a layout as text, one line for each entity.
+
+    Args:
+        layout (EntityLayout): the layout.
+
+    Returns:
+        str: the text.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac._layout_format import layout_text
+        >>> print(layout_text(EntityLayout({"arm": [0, 1]})))
+        EntityLayout(
+            arm: observation[0:2]
+        )
+    """
+    lines = []
+    for name in layout.names:
+        goal, achieved = layout.goal.get(name), layout.achieved.get(name)
+        if layout.is_flat:
+            observation = _key_text(layout.observation_key)
+            line = f"{observation}{column_ranges(layout.columns[name])}"
+            if goal:
+                line += f", goal{column_ranges(goal)}"
+                if achieved is not None:
+                    line += f" mirrors {observation}{column_ranges(achieved)}"
+        else:
+            line = _key_text(layout.keys[name])
+            if goal is not None:
+                line += f", goal {_key_text(goal)}"
+                if achieved is not None:
+                    line += f" mirrors {_key_text(achieved)}"
+        lines.append(f"    {name}: {line}{', fixed' if name in layout.fixed else ''}")
+    return "\n".join(["EntityLayout(", *lines, ")"])
+
+
+def _key_text(key: Any) -> str:
+    return key if isinstance(key, str) else repr(key)
