@@ -17,7 +17,7 @@ def test_get_leaf_names_what_is_there_and_what_to_do():
     assert get_leaf(td, ("next", "b"), "the data lack", "add it").sum() == 2
     with pytest.raises(KeyError, match=r"the data lack .*c.*; they have .*a.*: add it"):
         get_leaf(td, "c", "the data lack", "add it")
-    with pytest.raises(TypeError, match="'next' is a TensorDict, wanted a tensor"):
+    with pytest.raises(TypeError, match="'next' is a TensorDict, expected a tensor"):
         get_leaf(td, "next", "the data lack", "add it")
     error = missing_key(td, ["x", "y"], "lack", "add them")
     assert error.args[0].startswith("lack 'x' and 'y'; they have")

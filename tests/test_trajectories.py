@@ -101,9 +101,9 @@ def test_what_is_missing_or_misshapen_is_named():
     with pytest.raises(ValueError, match="both None"):
         trajectory_index(data, trajectory_key=None, done_key=None)
     data["episode"] = torch.zeros(3, 2)
-    with pytest.raises(ValueError, match=r"\[3, 2\], wanted \[T\] or \[T, 1\]"):
+    with pytest.raises(ValueError, match=r"\[3, 2\], expected \[T\] or \[T, 1\]"):
         trajectory_index(data)
-    with pytest.raises(TypeError, match="is a TensorDict, wanted a tensor"):
+    with pytest.raises(TypeError, match="is a TensorDict, expected a tensor"):
         trajectory_index(data, trajectory_key="next")
     with pytest.raises(ValueError, match="empty"):
         trajectory_index(LazyTensorStorage(3))

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, and folders with one writer."""
+"""Atomic writing of files and folders, and folders with one writing process."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _PARTIAL = ".partial-"
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Gives a file to write, which replaces ``path`` when the block ends well.
+    """Context manager that writes a file atomically.
 
-    The parent folder is created if it is missing. An exception leaves the old file as
-    it was.
+    The file replaces ``path`` at the end of the block. If the block raises, the old
+    file is unchanged. Missing parent folders are created.
 
     Args:
-        path (path): the file that is wanted.
+        path (path): the file to write.
 
     Yields:
-        Path: a file beside it with the same suffix.
+        Path: a temporary file in the same folder, with the same suffix.
 
     Examples:
         >>> import tempfile
@@ -52,13 +52,16 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Gives a folder to fill, which replaces ``path`` when the block ends well.
+    """Context manager that writes a folder atomically.
+
+    The folder replaces ``path`` at the end of the block. If the block raises, the old
+    folder is unchanged. Missing parent folders are created.
 
     Args:
-        path (path): the folder that is wanted.
+        path (path): the folder to write.
 
     Yields:
-        Path: a folder on the same file system, which does not exist yet.
+        Path: a temporary folder on the same file system, to be created in the block.
 
     Examples:
         >>> import tempfile
@@ -89,10 +92,10 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON keeps it: mappings become dictionaries, sequences lists.
+    """Converts mappings to dictionaries and sequences to lists, for JSON.
 
     Args:
-        value (Any): a ``DictConfig`` for example.
+        value (Any): the value, for example a ``DictConfig``.
 
     Returns:
         Any: the same content in plain containers.
@@ -112,14 +115,14 @@ def plain(value: Any) -> Any:
 def write_json(
     path: str | os.PathLike[str], value: Any, *, indent: int | None = 1
 ) -> None:
-    """Writes a value as JSON, whole or not at all.
+    """Writes a value as JSON, atomically.
 
     Args:
-        path (path): the file, replaced if it exists.
+        path (path): the file. It is replaced if it exists.
         value (Any): mappings, sequences, strings, numbers, booleans and ``None``.
 
     Keyword Args:
-        indent (int, optional): spaces for each level. Defaults to 1.
+        indent (int, optional): the number of spaces for each level. Defaults to ``1``.
 
     Examples:
         >>> import tempfile
@@ -136,21 +139,22 @@ def write_json(
 
 @contextmanager
 def claim_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Makes this process the only one that may work in a folder.
+    """Context manager that locks a folder for this process.
 
-    The claim ends with the block, or with the process.
+    The lock ends with the block or with the process.
 
     Args:
-        folder (path): created if it is missing; gets a file ``.lock``.
+        folder (path): the folder, in which the file ``.lock`` is created. A missing
+            folder is created.
 
     Raises:
-        RuntimeError: another process has claimed the folder.
+        RuntimeError: another process has locked the folder.
 
     Examples:
         >>> import tempfile
         >>> from torchrl_caiac._files import claim_folder
         >>> with tempfile.TemporaryDirectory() as folder, claim_folder(folder):
-        ...     pass  # only this process writes here
+        ...     pass  # no other process works in the folder
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,7 @@
-"""Nested keys: one form, one way to look them up, one message when one is missing."""
+"""Nested keys: their canonical form, their JSON form, and errors for missing ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -23,16 +22,16 @@ __all__ = [
 
 
 def as_key(key: Any) -> NestedKey:
-    """A key in its canonical form, a ``str`` or a flat ``tuple`` of them.
+    """Returns a key in its canonical form, a ``str`` or a flat ``tuple`` of them.
 
     Args:
-        key (NestedKey): the key as a user gave it.
+        key (NestedKey): the key given by the user.
 
     Returns:
         NestedKey: the canonical key.
 
     Raises:
-        TypeError: it is no key.
+        TypeError: ``key`` is not a key.
 
     Examples:
         >>> from torchrl_caiac._keys import as_key
@@ -40,15 +39,15 @@ def as_key(key: Any) -> NestedKey:
         (('next', 'observation'), 'done')
     """
     if not isinstance(key, (str, tuple)):
-        raise TypeError(f"a key is a str or a tuple of str, got {key!r}")
+        raise TypeError(f"a key must be a str or a tuple of str, got {key!r}")
     return unravel_key(key)
 
 
 def path(key: NestedKey) -> tuple[str, ...]:
-    """A canonical key as a tuple, even where it has one part.
+    """Returns a canonical key as a tuple, even if it has only one part.
 
     Args:
-        key (NestedKey): the key.
+        key (NestedKey): the canonical key.
 
     Returns:
         tuple of str: its parts.
@@ -62,10 +61,10 @@ def path(key: NestedKey) -> tuple[str, ...]:
 
 
 def join(*keys: NestedKey) -> NestedKey:
-    """The key of an entry below other entries.
+    """Returns the key of an entry below other entries.
 
     Args:
-        *keys (NestedKey): from the outermost to the innermost.
+        *keys (NestedKey): the keys, from the outermost to the innermost.
 
     Returns:
         NestedKey: the canonical key.
@@ -79,7 +78,13 @@ def join(*keys: NestedKey) -> NestedKey:
 
 
 def jsonable(key: NestedKey | None) -> Any:
-    """A key as JSON keeps it: a tuple becomes a list.
+    """Returns a key in its JSON form, in which a tuple becomes a list.
+
+    Args:
+        key (NestedKey, optional): the key.
+
+    Returns:
+        str, list of str or None: the JSON form.
 
     Examples:
         >>> from torchrl_caiac._keys import jsonable
@@ -90,7 +95,13 @@ def jsonable(key: NestedKey | None) -> Any:
 
 
 def key_from_json(value: Any) -> Any:
-    """The key that :func:`jsonable` described.
+    """Returns the key that :func:`jsonable` converted.
+
+    Args:
+        value (Any): the JSON form.
+
+    Returns:
+        NestedKey: the key.
 
     Examples:
         >>> from torchrl_caiac._keys import key_from_json
@@ -101,13 +112,13 @@ def key_from_json(value: Any) -> Any:
 
 
 def leaf_names(td: TensorDictBase) -> list[str]:
-    """The leaves of a tensordict, sorted, to be named in an error.
+    """Returns the keys of all leaves of a tensordict, sorted, for error messages.
 
     Args:
         td (TensorDictBase): the data.
 
     Returns:
-        list of str: one text for each leaf.
+        list of str: the key of each leaf, as text.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -119,19 +130,19 @@ def leaf_names(td: TensorDictBase) -> list[str]:
 
 
 def missing_key(
-    td: TensorDictBase, keys: NestedKey | Iterable[NestedKey], what: str, remedy: str
+    td: TensorDictBase, keys: NestedKey | list[NestedKey], what: str, remedy: str
 ) -> KeyError:
-    """The error to raise where data lack what is read from them.
+    """Returns the error to raise if data lack a key.
 
     Args:
         td (TensorDictBase): the data.
-        keys (NestedKey or list of NestedKey): what is missing.
-        what (str): the data and who reads them, such as ``"the storage lacks the
-            observation"``.
-        remedy (str): what to do about it.
+        keys (NestedKey or list of NestedKey): the missing key or keys.
+        what (str): the beginning of the message, which names the data and the meaning
+            of the key, such as ``"the storage lacks the observation"``.
+        remedy (str): the end of the message, which says what to do.
 
     Returns:
-        KeyError: to be raised.
+        KeyError: the error.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -149,20 +160,20 @@ def missing_key(
 def get_leaf(
     td: TensorDictBase, key: NestedKey, what: str, remedy: str
 ) -> torch.Tensor:
-    """A tensor of some data.
+    """Returns a tensor of a tensordict.
 
     Args:
         td (TensorDictBase): the data.
-        key (NestedKey): where it is.
+        key (NestedKey): the key of the tensor.
         what (str): as in :func:`missing_key`.
         remedy (str): as in :func:`missing_key`.
 
     Returns:
-        torch.Tensor: the leaf.
+        torch.Tensor: the tensor.
 
     Raises:
-        KeyError: there is none.
-        TypeError: it is no tensor.
+        KeyError: the key is missing.
+        TypeError: the entry is not a tensor.
 
     Examples:
         >>> import torch
@@ -176,20 +187,20 @@ def get_leaf(
     if value is None:
         raise missing_key(td, key, what, remedy)
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{key!r} is a {type(value).__name__}, wanted a tensor")
+        raise TypeError(f"{key!r} is a {type(value).__name__}, expected a tensor")
     return value
 
 
 def flatten(value: Any, batch_dims: int) -> torch.Tensor:
-    """The features of an entry side by side, in the order of their sorted names.
+    """Flattens an entry after its batch dimensions.
 
     Args:
-        value (torch.Tensor or TensorDictBase): ``[*B, ...]``; a tensordict's leaves
-            are flattened one after another.
+        value (torch.Tensor or TensorDictBase): ``[*B, ...]``. The leaves of a
+            tensordict are concatenated in the order of their sorted keys.
         batch_dims (int): the number of batch dimensions.
 
     Returns:
-        torch.Tensor: ``[*B, W]``; integers become floating point.
+        torch.Tensor: ``[*B, W]``. Integers and booleans become floating point.
 
     Examples:
         >>> import torch

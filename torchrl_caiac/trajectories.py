@@ -1,4 +1,4 @@
-"""Which stored transition follows which: the one index of trajectories."""
+"""The index of the trajectories in a storage: which transition follows which."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ from torchrl_caiac._torchrl import last_written, storage_data, storage_revision
 
 __all__ = ["TrajectoryCache", "TrajectoryIndex", "trajectory_index"]
 
-# Where TorchRL's collectors store trajectory ids.
+# The key of the trajectory ids of TorchRL's collectors.
 _COLLECTOR_KEY: NestedKey = ("collector", "traj_ids")
 _CHUNK = 1 << 20
 
 
 class TrajectoryIndex(NamedTuple):
-    """Where the trajectories of a storage end, in the order of time.
+    """The trajectories of a storage, in the order of time.
 
-    The row ``r`` is at position ``(r - oldest) % length``. Positions count from the
-    oldest row, so no trajectory wraps around. The index takes 4 bytes for each row.
+    The row ``r`` has the position ``(r - oldest) % length``. Positions count from the
+    oldest row, so that no trajectory wraps around. The index takes 4 bytes for each
+    row.
 
     Attributes:
-        length (int): rows in the storage, ``T``.
-        oldest (int): the oldest row, the one after the write cursor of a full ring.
-        ends (torch.Tensor): int64 ``[E]``, ascending positions of last rows.
-        left (torch.Tensor): integer ``[T]``, how many rows of the same trajectory
-            follow each row.
+        length (int): the number of rows in the storage, ``T``.
+        oldest (int): the oldest row: in a full ring, the one after the newest.
+        ends (torch.Tensor): int64 ``[E]``, the positions of the last row of each
+            trajectory, ascending.
+        left (torch.Tensor): integer ``[T]``, the number of rows of the same trajectory
+            after each row.
     """
 
     length: int
@@ -41,7 +43,7 @@ class TrajectoryIndex(NamedTuple):
 
     @property
     def device(self) -> torch.device:
-        """Where the index is."""
+        """The device of the index."""
         return self.ends.device
 
     @property
@@ -56,7 +58,7 @@ class TrajectoryIndex(NamedTuple):
 
     @property
     def wraps(self) -> bool:
-        """Whether a trajectory goes on from the storage's last row to its first."""
+        """Whether a trajectory continues from the last row to the first."""
         return self.oldest > 0 and bool(self.left[self.length - 1] > 0)
 
     def position(self, rows: torch.Tensor) -> torch.Tensor:
@@ -68,7 +70,7 @@ class TrajectoryIndex(NamedTuple):
         return (position + self.oldest) % self.length
 
     def remaining(self, rows: torch.Tensor) -> torch.Tensor:
-        """How many rows of the same trajectory follow each row, int64 ``[*]``."""
+        """The number of rows of the same trajectory after each row, int64 ``[*]``."""
         found = self.left.index_select(0, rows.to(self.device).reshape(-1))
         return found.view(rows.shape).long()
 
@@ -81,7 +83,7 @@ class TrajectoryIndex(NamedTuple):
         return (rows + steps) % self.length
 
     def numbers(self) -> torch.Tensor:
-        """The trajectory of each row, from 0 in the order of time, int64 ``[T]``."""
+        """The trajectory of each row, counted from 0 by time, int64 ``[T]``."""
         counts = torch.arange(len(self.ends), device=self.device)
         return counts.repeat_interleave(self.lengths).roll(self.oldest)
 
@@ -94,11 +96,11 @@ def trajectory_index(
 ) -> TrajectoryIndex:
     """Finds the trajectories of stored transitions.
 
-    The transitions of a trajectory lie one after another. A trajectory ends where the
-    id in ``trajectory_key`` changes, where ``done_key`` is set, at the row that was
-    written last, and at the end of the storage; in a full ring it goes on from the last
-    row to the first. Where the data have no ``trajectory_key``, the ids of TorchRL's
-    collectors in ``("collector", "traj_ids")`` are read. Data with ids may lack
+    The transitions of a trajectory are consecutive. A trajectory ends where the id in
+    ``trajectory_key`` changes, where ``done_key`` is set, at the row that was written
+    last, and at the end of the storage. In a full ring, a trajectory continues from the
+    last row to the first. If the data lack ``trajectory_key``, the ids of TorchRL's
+    collectors in ``("collector", "traj_ids")`` are used. Data with ids may lack
     ``done_key``.
 
     Args:
@@ -106,18 +108,19 @@ def trajectory_index(
             ``[T]``.
 
     Keyword Args:
-        trajectory_key (NestedKey, optional): trajectory ids ``[T]`` or ``[T, 1]``;
-            ``None`` to rely on ``done_key`` alone. Defaults to ``"episode"``.
-        done_key (NestedKey, optional): end flags ``[T]`` or ``[T, 1]``; ``None`` to
-            rely on ``trajectory_key`` alone. Defaults to ``("next", "done")``.
+        trajectory_key (NestedKey, optional): the key of the trajectory ids, ``[T]`` or
+            ``[T, 1]``; ``None`` to use ``done_key`` alone. Defaults to ``"episode"``.
+        done_key (NestedKey, optional): the key of the end flags, ``[T]`` or ``[T, 1]``;
+            ``None`` to use ``trajectory_key`` alone. Defaults to ``("next", "done")``.
 
     Returns:
         TrajectoryIndex: the trajectories.
 
     Raises:
-        KeyError: the data lack the leaf.
-        TypeError: the storage holds no tensordict.
-        ValueError: the storage is empty or has several dimensions, a leaf does not
+        KeyError: the data lack the ids or the end flags.
+        TypeError: the storage does not contain a tensordict, or an entry is not a
+            tensor.
+        ValueError: the storage is empty or has several dimensions, an entry does not
             have one value for each row, or both keys are ``None``.
 
     Examples:
@@ -138,16 +141,16 @@ def trajectory_index(
         data, length = storage_data(storage), len(storage)
         if storage.ndim != 1:
             raise ValueError(
-                f"the storage has ndim={storage.ndim}, wanted 1: store flat "
+                f"the storage has ndim={storage.ndim}, expected 1: store flat "
                 "transitions, with trajectory ids"
             )
         newest = last_written(source)
     ids, done = _leaves(data, length, trajectory_key, done_key)
-    # Only a full ring goes on from its last row to its first.
+    # Only in a full ring does a trajectory continue from the last row to the first.
     is_ring = length == data.shape[0] and newest is not None and newest < length - 1
     oldest = newest + 1 if is_ring and newest is not None else 0
     leaf = done if ids is None else ids
-    assert leaf is not None  # one of them is there
+    assert leaf is not None  # _leaves returns at least one
     last = torch.zeros(length, dtype=torch.bool, device=leaf.device)
     if ids is not None:
         ids = ids.roll(-oldest) if oldest else ids
@@ -225,7 +228,7 @@ def _leaves(
     trajectory_key: NestedKey | None,
     done_key: NestedKey | None,
 ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """The ids and the end flags ``[T]``, as far as they are there and wanted."""
+    """Returns the ids and the end flags ``[T]``, ``None`` if unused or missing."""
     if trajectory_key is None and done_key is None:
         raise ValueError(
             "trajectory_key and done_key are both None: one of them must tell where "
@@ -241,9 +244,9 @@ def _leaves(
                 data,
                 trajectory_key,
                 "the transitions lack the trajectory ids",
-                "name the leaf that has them; or pass trajectory_key=None to tell "
-                "trajectories apart by end flags alone, which is right only where the "
-                "transitions of each lie one after another",
+                "pass trajectory_key= with the key of the ids, or trajectory_key=None "
+                "to use the end flags alone, which is correct only if the transitions "
+                "of each trajectory are consecutive",
             )
     if done_key is not None:
         done = data.get(done_key, None)
@@ -252,7 +255,7 @@ def _leaves(
                 data,
                 done_key,
                 "the transitions lack the end flags",
-                "name the leaf that has them by done_key",
+                "pass done_key= with the key of the flags",
             )
     return (
         None if ids is None else _flat(ids, length, trajectory_key),
@@ -262,11 +265,11 @@ def _leaves(
 
 def _flat(leaf: torch.Tensor, length: int, key: NestedKey | None) -> torch.Tensor:
     if not isinstance(leaf, torch.Tensor):
-        raise TypeError(f"{key!r} is a {type(leaf).__name__}, wanted a tensor")
+        raise TypeError(f"{key!r} is a {type(leaf).__name__}, expected a tensor")
     if leaf.numel() != leaf.shape[0]:
         raise ValueError(
-            f"{key!r} has shape {list(leaf.shape)}, wanted [T] or [T, 1]: one value "
+            f"{key!r} has shape {list(leaf.shape)}, expected [T] or [T, 1]: one value "
             "for each transition"
         )
-    # A memory-mapped tensor as a plain one skips its Python dispatch.
+    # As a plain tensor, because memory-mapped ones have a slow Python dispatch.
     return leaf.as_subclass(torch.Tensor)[:length].reshape(length)
