@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 
-from torchrl_caiac import plotting
 from torchrl_caiac.plotting import (
     bootstrap_interval,
     plot_frames,
@@ -39,11 +38,16 @@ class TestInfluence:
         assert path.stat().st_size > 5000
 
     def test_true_contacts(self, scores):
-        truth = np.zeros(scores.shape, dtype=bool)
-        truth[22:28, 2] = True
-        truth[40:44, 1] = truth[50:52, 1] = True  # contact without a score
+        contact = np.zeros(scores.shape, dtype=bool)
+        contact[22:28, 2] = True
+        contact[40:44, 1] = contact[50:52, 1] = True  # contact without a score
         figure = plot_influence(
-            scores, NAMES, truth=truth, threshold=0.3, exclude=["robot"], title="x"
+            scores,
+            NAMES,
+            ground_truth=contact,
+            threshold=0.3,
+            exclude=["robot"],
+            title="x",
         )
         assert legend(figure)[:2] == ["kettle", "microwave"]
         strip = figure.axes[1]
@@ -67,7 +71,7 @@ class TestInfluence:
     def test_gaps_one_row_and_many_entities(self, scores):
         scores[3:6] = np.nan
         plot_influence(scores, NAMES, threshold=0.3)
-        plot_influence(scores[:1], NAMES, truth=np.ones((1, 5), bool))
+        plot_influence(scores[:1], NAMES, ground_truth=np.ones((1, 5), bool))
         plot_influence(np.full((4, 5), np.nan), NAMES)
         figure = plot_influence(np.ones((4, 12)), [f"e{i}" for i in range(12)])
         looks = [(x.get_color(), x.get_linestyle()) for x in figure.axes[0].lines]
@@ -82,9 +86,9 @@ class TestInfluence:
         ("changes", "message"),
         [
             ({"names": NAMES[:3]}, r"\[L, 3\]"),
-            ({"scores": np.zeros((0, 5))}, "a row at least"),
-            ({"truth": np.zeros((60, 5))}, "wanted bool"),
-            ({"truth": np.zeros((6, 5), bool)}, r"\(60, 5\)"),
+            ({"scores": np.zeros((0, 5))}, "at least one row"),
+            ({"ground_truth": np.zeros((60, 5))}, "expected bool"),
+            ({"ground_truth": np.zeros((6, 5), bool)}, r"\(60, 5\)"),
             ({"exclude": ["toaster"]}, "toaster"),
             ({"exclude": NAMES}, "no entity"),
         ],
@@ -161,7 +165,7 @@ class TestLearningCurves:
             ends = bands[0][bands[0][:, 0] == x, 1]
             expected = bootstrap_interval(values, confidence=0.8)
             assert (ends.min(), ends.max()) == pytest.approx(expected)
-        # One run tells nothing of others.
+        # The band of a single run has no width.
         assert set(bands[1][:, 1].round(9)) == {0.2, 0.8}
         assert -0.05 < axes.get_ylim()[0] <= 0
         figure.savefig(tmp_path / "curves.png")
@@ -210,14 +214,13 @@ class TestFrames:
             plot_frames([frame], columns=0)
 
 
-def test_matplotlib_waits_until_it_is_needed():
-    # The file alone: the package around it imports torch, which takes seconds.
+def test_matplotlib_is_imported_on_use():
     code = (
-        "import runpy, sys; "
-        f"names = runpy.run_path({plotting.__file__!r}); "
+        "import sys; "
+        "from torchrl_caiac.plotting import plot_frames; "
         "assert 'matplotlib' not in sys.modules and 'scipy' not in sys.modules; "
         "import numpy as np; "
-        "names['plot_frames'](np.zeros((1, 4, 4, 3))); "
+        "plot_frames(np.zeros((1, 4, 4, 3))); "
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=240)

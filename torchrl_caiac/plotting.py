@@ -1,4 +1,8 @@
-"""The paper's figures: frames (Fig. 1), success (Figs. 3, 4), influence (Fig. 6)."""
+"""The figures of the paper: frames (Fig. 1), success (Figs. 3, 4), influence (Fig. 6).
+
+All functions return a :class:`matplotlib.figure.Figure` without pyplot, so no display
+is needed and no figure has to be closed. Matplotlib and SciPy are imported on use.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchrl_caiac._figures import (
+    GREY,
+    NUM_COLOURS,
+    colour,
+    finish_results,
+    name_label,
+    new_figure,
+    remove_frame,
+)
+
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
@@ -21,50 +34,31 @@ __all__ = [
     "plot_success",
 ]
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; yellow left out.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#333333")
-_QUIET = "#BBBBBB"
-
-
-def _figure(width: float, height: float, pad: float = 0.04) -> Figure:
-    # Not pyplot: no global state, no display, nothing to close.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-    layout = ConstrainedLayoutEngine(w_pad=pad, h_pad=pad, wspace=0.01, hspace=0.02)
-    figure = Figure(figsize=(width, height), dpi=150, layout=layout)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _plain(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_axisbelow(True)
-
-
-def _label(name: str) -> str:
-    return name.replace("_", " ")
-
 
 def bootstrap_interval(
     values: ArrayLike, *, confidence: float = 0.95, resamples: int = 9999, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the percentile-bootstrap confidence interval of a mean.
+    """Returns the percentile-bootstrap confidence interval of a mean.
 
     Args:
-        values: ``[R]`` results of independent runs (seeds, or episodes).
+        values (array-like): ``[R]``, the results of independent runs, such as seeds or
+            episodes.
 
     Keyword Args:
-        confidence: level, in (0, 1).
-        resamples: how many.
-        seed: of the resampling.
+        confidence (float): the confidence level, in (0, 1). Defaults to ``0.95``.
+        resamples (int): the number of bootstrap samples. Defaults to ``9999``.
+        seed (int): the seed of the resampling. Defaults to ``0``.
 
     Returns:
-        lower and upper end; both the mean where all values are equal, and for a single
-        value.
+        tuple of float and float: the lower and the upper end; both are the mean if all
+        values are equal.
 
-    Example:
+    Raises:
+        ValueError: there are no values, a value is not finite, or ``confidence`` is out
+            of range.
+
+    Examples:
+        >>> from torchrl_caiac.plotting import bootstrap_interval
         >>> bootstrap_interval([1.0, 1.0, 1.0])
         (1.0, 1.0)
         >>> low, high = bootstrap_interval([0.0, 1.0, 1.0, 1.0])
@@ -76,11 +70,11 @@ def bootstrap_interval(
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
         raise ValueError(
-            f"values have shape {array.shape}, wanted [R] with at least one value, all "
-            "finite"
+            f"values have shape {array.shape}, expected [R] with at least one value, "
+            "all finite"
         )
     if not 0 < confidence < 1:
-        raise ValueError(f"confidence is {confidence}, wanted between 0 and 1")
+        raise ValueError(f"confidence is {confidence}, expected above 0 and below 1")
     if np.ptp(array) == 0:
         return float(array[0]), float(array[0])
     interval = bootstrap(
@@ -98,35 +92,44 @@ def plot_influence(
     scores: ArrayLike,
     names: Sequence[str],
     *,
-    truth: ArrayLike | None = None,
+    ground_truth: ArrayLike | None = None,
     threshold: float | None = None,
     exclude: Sequence[str] = (),
     step_seconds: float | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw the influence of the action on every entity along a demonstration (Fig. 6).
+    """Plots the influence of the action on each entity along a demonstration (Fig. 6).
 
-    An entity is drawn in colour if its score passes the threshold somewhere, or if the
-    truth has contact with it; the others are one grey bundle. True contacts are shaded
-    in the entity's colour, with bars under the curves.
+    An entity gets a colour if its score exceeds the threshold in some row, or if the
+    ground truth has contact with it in some row. All others are grey. Rows with contact
+    are shaded in the entity's colour, and shown as bars below the curves.
 
     Args:
-        scores: ``[L, N]``, rows in time order; NaN leaves a gap.
-        names: the ``N`` entities.
+        scores (array-like): ``[L, N]``, rows in the order of time. NaN leaves a gap.
+        names (sequence of str): the ``N`` entities.
 
     Keyword Args:
-        truth: bool ``[L, N]``, of
-            :func:`~torchrl_caiac.influence.truth.true_influence`.
-        threshold: θ, drawn as a dashed line. Without it the highlighted entities are
-            those above a tenth of the highest score.
-        exclude: entities left out, the robot say.
-        step_seconds: seconds a row, for a time axis in seconds instead of steps.
-        title: of the figure.
+        ground_truth (array-like, optional): bool ``[L, N]``, the contacts, as returned
+            by :func:`~torchrl_caiac.influence.truth.true_influence`. Defaults to
+            ``None``: not drawn.
+        threshold (float, optional): the threshold θ, drawn as a dashed line. Defaults
+            to ``None``: entities above a tenth of the highest score get a colour.
+        exclude (sequence of str): entities to leave out, such as the robot. Defaults to
+            ``()``.
+        step_seconds (float, optional): the duration of a row, for a time axis in
+            seconds. Defaults to ``None``: the axis counts steps.
+        title (str): the title of the figure. Defaults to ``""``.
 
     Returns:
-        the figure; ``figure.savefig(path)`` writes it.
+        matplotlib.figure.Figure: the figure.
 
-    Example:
+    Raises:
+        ValueError: a shape or a type is wrong, or ``exclude`` names an unknown entity
+            or all of them.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_caiac.plotting import plot_influence
         >>> rng = np.random.default_rng(0)
         >>> figure = plot_influence(
         ...     rng.random((40, 2)), ["kettle", "microwave"], threshold=0.3
@@ -137,27 +140,27 @@ def plot_influence(
     values = np.asarray(scores, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] != len(names) or not len(values):
         raise ValueError(
-            f"scores have shape {values.shape}, wanted [L, {len(names)}] with a row at "
-            "least"
+            f"scores have shape {values.shape}, expected [L, {len(names)}] with at "
+            "least one row"
         )
     contact: NDArray[np.bool_] | None = None
-    if truth is not None:
-        contact = np.asarray(truth)
+    if ground_truth is not None:
+        contact = np.asarray(ground_truth)
         if contact.shape != values.shape or contact.dtype != np.bool_:
             raise ValueError(
-                f"truth has shape {contact.shape} and dtype {contact.dtype}, wanted "
-                f"bool {values.shape}"
+                f"ground_truth has shape {contact.shape} and dtype {contact.dtype}, "
+                f"expected bool {values.shape}"
             )
     unknown = sorted(set(exclude) - set(names))
     if unknown:
-        raise ValueError(f"exclude names {unknown}, wanted among {tuple(names)}")
+        raise ValueError(f"exclude names {unknown}, expected some of {tuple(names)}")
     kept = [i for i, name in enumerate(names) if name not in exclude]
     if not kept:
         raise ValueError("exclude leaves no entity to draw")
     drawn = np.where(np.isfinite(values[:, kept]), values[:, kept], 0.0)
     top = max(float(drawn.max()), 0.0 if threshold is None else float(threshold))
     bar = 0.1 * top if threshold is None else threshold
-    loud = [
+    coloured = [
         i
         for i in kept
         if (np.nan_to_num(values[:, i], nan=-np.inf) > bar).any()
@@ -166,22 +169,22 @@ def plot_influence(
     time = np.arange(len(values)) * (1.0 if step_seconds is None else step_seconds)
     pitch = time[1] if len(time) > 1 else 1.0
 
-    bars = 0 if contact is None else len(loud)
-    figure = _figure(7.0, 3.1 + 0.22 * bars)
+    bars = 0 if contact is None else len(coloured)
+    figure = new_figure(7.0, 3.1 + 0.22 * bars)
     grid = figure.add_gridspec(
         2 if bars else 1, 1, height_ratios=(3.1, 0.22 * bars) if bars else (1,)
     )
     axes = figure.add_subplot(grid[0])
-    colours = {i: _COLOURS[n % len(_COLOURS)] for n, i in enumerate(loud)}
-    for i in loud:
+    colours = {i: colour(n) for n, i in enumerate(coloured)}
+    for i in coloured:
         axes.plot(
             time,
             values[:, i],
             color=colours[i],
-            # More entities than colours: the second round is dashed.
-            linestyle="-" if loud.index(i) < len(_COLOURS) else "--",
+            # With more entities than colours, the second round is dashed.
+            linestyle="-" if coloured.index(i) < NUM_COLOURS else "--",
             linewidth=1.8,
-            label=_label(names[i]),
+            label=name_label(names[i]),
             zorder=3,
         )
         for a, b in [] if contact is None else _runs(contact[:, i]):
@@ -193,17 +196,17 @@ def plot_influence(
                 linewidth=0,
                 zorder=0,
             )
-    quiet = [i for i in kept if i not in loud]
-    for n, i in enumerate(quiet):
+    grey = [i for i in kept if i not in coloured]
+    for n, i in enumerate(grey):
         label = (
-            f"{len(quiet)} {'others' if loud else 'entities'}"
-            if n == 0 and len(quiet) > 1
-            else _label(names[i])
+            f"{len(grey)} {'others' if coloured else 'entities'}"
+            if n == 0 and len(grey) > 1
+            else name_label(names[i])
         )
         axes.plot(
             time,
             values[:, i],
-            color=_QUIET,
+            color=GREY,
             linewidth=1,
             label=label if n == 0 else "_",
             zorder=1,
@@ -217,7 +220,7 @@ def plot_influence(
             label=f"θ = {threshold:g}",
             zorder=2,
         )
-    _plain(axes)
+    remove_frame(axes)
     axes.set_ylabel("influence score")
     axes.set_xlim(time[0], max(time[-1], pitch))
     axes.set_ylim(min(0.0, float(drawn.min())), 1.05 * top if top > 0 else 1.0)
@@ -228,7 +231,7 @@ def plot_influence(
     if bars and contact is not None:
         axes.tick_params(labelbottom=False)
         strip = figure.add_subplot(grid[1], sharex=axes)
-        for row, i in enumerate(loud):
+        for row, i in enumerate(coloured):
             strip.broken_barh(
                 [
                     (time[a] - pitch / 2, (b - a) * pitch)
@@ -237,28 +240,30 @@ def plot_influence(
                 (row + 0.12, 0.76),
                 facecolors=colours[i],
             )
-        strip.set_ylim(len(loud), 0)
+        strip.set_ylim(len(coloured), 0)
         strip.set_yticks(
-            np.arange(len(loud)) + 0.5, [_label(names[i]) for i in loud], fontsize=8
+            np.arange(len(coloured)) + 0.5,
+            [name_label(names[i]) for i in coloured],
+            fontsize=8,
         )
         strip.tick_params(left=False)
         strip.spines[["top", "right", "left"]].set_visible(False)
-        strip.set_title("true contact", fontsize=8, loc="left", pad=2)
+        strip.set_title("contact (ground truth)", fontsize=8, loc="left", pad=2)
         last = strip
     last.set_xlabel("step" if step_seconds is None else "time (s)")
     return figure
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the half-open ranges in which a mask is true."""
+    """Returns the half-open ranges in which a mask is true."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-# Title, column (or columns to add up) and axis of each panel of plot_comparison.
+# The title, the columns (which are summed) and the axis of each panel.
 _PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    ("AUC of the action's influence", ("auc",), "share"),
-    ("links above θ", ("density",), "share"),
+    ("AUC of the influence", ("auc",), "share"),
+    ("scores above θ", ("density",), "share"),
     ("counterfactual rows with a swap", ("rows_swapped",), "share"),
     ("infeasible swaps", ("infeasible",), "share"),
     ("seconds to fit and to score", ("fit_seconds", "score_seconds"), "log"),
@@ -266,20 +271,22 @@ _PANELS: tuple[tuple[str, tuple[str, ...], str], ...] = (
 
 
 def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw how influence estimators compare, one panel a measure.
+    """Plots a comparison of influence estimators, one panel for each measure.
 
     Args:
-        rows: of :func:`~torchrl_caiac.evaluation.compare_influence`, with the name of
-            the ``"experiment"`` in each; as numbers, or as strings of a CSV file. Only
-            those over all entities are drawn; what is empty is left out.
+        rows (sequence of mapping): the results of
+            :func:`~torchrl_caiac.evaluation.compare_influence`, with the name of the
+            ``"experiment"`` in each; numbers, or the strings of a CSV file. Only the
+            rows over all entities are plotted, and empty values are left out.
 
     Returns:
-        the figure.
+        matplotlib.figure.Figure: the figure.
 
     Raises:
         ValueError: there is no row over all entities.
 
-    Example:
+    Examples:
+        >>> from torchrl_caiac.plotting import plot_comparison
         >>> row = {"experiment": "push", "estimator": "caiac", "entity": "all"}
         >>> figure = plot_comparison([{**row, "auc": "0.9", "rows_swapped": 0.5}])
         >>> [len(axes.patches) for axes in figure.axes]
@@ -287,11 +294,13 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """
     shown = [row for row in rows if row["entity"] == "all"]
     if not shown:
-        raise ValueError("rows hold none over all entities: there is nothing to draw")
+        raise ValueError(
+            "no row has the entity 'all': pass all rows of compare_influence"
+        )
     experiments = list(dict.fromkeys(row["experiment"] for row in shown))
     estimators = list(dict.fromkeys(row["estimator"] for row in shown))
     width = 0.8 / len(estimators)
-    figure = _figure(10.0, 5.0)
+    figure = new_figure(10.0, 5.0)
     grid = figure.subplots(2, 3).ravel()
     grid[-1].remove()
     for axes, (title, columns, kind) in zip(grid, _PANELS, strict=False):
@@ -307,21 +316,21 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 place + (n - (len(estimators) - 1) / 2) * width,
                 height,
                 0.9 * width,
-                color=_COLOURS[n % len(_COLOURS)],
+                color=colour(n),
             )
         axes.set_title(title, fontsize=9)
-        labels = [_label(e) for e in experiments]
+        labels = [name_label(e) for e in experiments]
         axes.set_xticks(range(len(experiments)), labels, fontsize=8)
         if kind == "log" and axes.patches:
             axes.set_yscale("log")
         elif kind == "share":
             axes.set_ylim(0, 1.02)
-        _plain(axes)
+        remove_frame(axes)
     from matplotlib.patches import Patch
 
     figure.legend(
         handles=[
-            Patch(color=_COLOURS[n % len(_COLOURS)], label=_label(name))
+            Patch(color=colour(n), label=name_label(name))
             for n, name in enumerate(estimators)
         ],
         loc="lower right",
@@ -338,22 +347,28 @@ def plot_success(
     ylabel: str = "success rate",
     title: str = "",
 ) -> Figure:
-    """Draw success per task and arm, with bootstrap confidence intervals (Fig. 3).
+    """Plots success by task and method, with bootstrap confidence intervals (Fig. 3).
 
     Args:
-        results: arm to task to the results ``[R]`` of independent runs (one success
-            rate a seed, or one success an episode).
+        results (mapping of str to mapping of str to array-like): for each method and
+            task, the results ``[R]`` of independent runs: one success rate for each
+            seed, or one success for each episode.
 
     Keyword Args:
-        confidence: level of the intervals.
-        labels: what to write for an arm or a task instead of its name.
-        ylabel: of the vertical axis.
-        title: of the figure.
+        confidence (float): the confidence level of the intervals. Defaults to ``0.95``.
+        labels (mapping of str to str, optional): labels of methods and tasks. Defaults
+            to ``None``: their names.
+        ylabel (str): the label of the vertical axis. Defaults to ``"success rate"``.
+        title (str): the title of the figure. Defaults to ``""``.
 
     Returns:
-        the figure.
+        matplotlib.figure.Figure: the figure.
 
-    Example:
+    Raises:
+        ValueError: there are no results, or a method lacks a task.
+
+    Examples:
+        >>> from torchrl_caiac.plotting import plot_success
         >>> figure = plot_success(
         ...     {
         ...         "none": {"kettle": [1.0, 0.9], "microwave": [0.0, 0.05]},
@@ -364,36 +379,40 @@ def plot_success(
         [0.95, 0.025]
     """
     labels = labels or {}
-    arms = list(results)
-    tasks = list(dict.fromkeys(task for arm in arms for task in results[arm]))
-    if not arms or not tasks:
-        raise ValueError("results are empty, wanted {arm: {task: [R] results}}")
-    for arm in arms:
-        missing = sorted(set(tasks) - set(results[arm]))
+    methods = list(results)
+    tasks = list(dict.fromkeys(task for method in methods for task in results[method]))
+    if not methods or not tasks:
+        raise ValueError("results are empty, expected {method: {task: [R] results}}")
+    for method in methods:
+        missing = sorted(set(tasks) - set(results[method]))
         if missing:
-            raise ValueError(f"the results of arm {arm!r} lack the tasks {missing}")
+            raise ValueError(
+                f"the results of method {method!r} lack the tasks {missing}: add them"
+            )
 
     def label(name: str) -> str:
-        return labels.get(name, _label(name))
+        return labels.get(name, name_label(name))
 
-    width = 0.8 / len(arms)
-    figure = _figure(max(3.6, 1.2 + 0.62 * len(tasks) * len(arms) * 0.9 + 0.8), 3.2)
+    width = 0.8 / len(methods)
+    figure = new_figure(
+        max(3.6, 1.2 + 0.62 * len(tasks) * len(methods) * 0.9 + 0.8), 3.2
+    )
     axes = figure.add_subplot()
-    for n, arm in enumerate(arms):
+    for n, method in enumerate(methods):
         means, low, high = [], [], []
         for task in tasks:
-            runs = np.asarray(results[arm][task], dtype=np.float64)
+            runs = np.asarray(results[method][task], dtype=np.float64)
             bottom, top = bootstrap_interval(runs, confidence=confidence)
             means.append(float(runs.mean()))
             low.append(means[-1] - bottom)
             high.append(top - means[-1])
-        centre = np.arange(len(tasks)) + (n - (len(arms) - 1) / 2) * width
+        centre = np.arange(len(tasks)) + (n - (len(methods) - 1) / 2) * width
         bars = axes.bar(
             centre,
             means,
             0.9 * width,
-            color=_COLOURS[n % len(_COLOURS)],
-            label=label(arm),
+            color=colour(n),
+            label=label(method),
         )
         axes.errorbar(
             centre,
@@ -414,19 +433,13 @@ def plot_success(
                 ha="center",
                 fontsize=8,
             )
-    _plain(axes)
     axes.set_xticks(np.arange(len(tasks)), [label(task) for task in tasks])
     axes.tick_params(axis="x", length=0)
-    axes.set_ylabel(ylabel)
     axes.set_ylim(0, 1.1)
     axes.set_yticks(np.linspace(0, 1, 5))
-    axes.grid(axis="y", color="#E5E5E5", linewidth=0.8)
-    figure.legend(
-        loc="outside lower center", ncols=min(len(arms), 4), frameon=False, fontsize=9
+    return finish_results(
+        figure, axes, methods=len(methods), ylabel=ylabel, title=title
     )
-    if title:
-        axes.set_title(title, fontsize=11, loc="left")
-    return figure
 
 
 def plot_learning_curves(
@@ -438,23 +451,29 @@ def plot_learning_curves(
     ylabel: str = "success rate",
     title: str = "",
 ) -> Figure:
-    """Draw each arm's mean along training, with bootstrap confidence bands.
+    """Plots the mean of each method during training, with bootstrap confidence bands.
 
     Args:
-        curves: arm to the steps ``[P]`` of its measurements and their values
-            ``[R, P]`` in independent runs.
+        curves (mapping of str to tuple of array-likes): for each method, the steps
+            ``[P]`` of its evaluations and their results ``[R, P]`` in independent runs.
 
     Keyword Args:
-        confidence: level of the bands.
-        labels: what to write for an arm instead of its name.
-        xlabel: of the horizontal axis.
-        ylabel: of the vertical axis.
-        title: of the figure.
+        confidence (float): the confidence level of the bands. Defaults to ``0.95``.
+        labels (mapping of str to str, optional): labels of methods. Defaults to
+            ``None``: their names.
+        xlabel (str): the label of the horizontal axis. Defaults to
+            ``"gradient steps"``.
+        ylabel (str): the label of the vertical axis. Defaults to ``"success rate"``.
+        title (str): the title of the figure. Defaults to ``""``.
 
     Returns:
-        the figure.
+        matplotlib.figure.Figure: the figure.
 
-    Example:
+    Raises:
+        ValueError: there are no curves, or a shape is wrong.
+
+    Examples:
+        >>> from torchrl_caiac.plotting import plot_learning_curves
         >>> figure = plot_learning_curves(
         ...     {
         ...         "none": ([1000, 2000], [[0.0, 0.1], [0.0, 0.2]]),
@@ -465,43 +484,36 @@ def plot_learning_curves(
         [0.15, 0.45]
     """
     if not curves:
-        raise ValueError("curves are empty, wanted {arm: (steps [P], values [R, P])}")
+        raise ValueError(
+            "curves are empty, expected {method: (steps [P], values [R, P])}"
+        )
     labels = labels or {}
-    figure = _figure(5.2, 3.4)
+    figure = new_figure(5.2, 3.4)
     axes = figure.add_subplot()
-    for n, (arm, (at, values)) in enumerate(curves.items()):
+    for n, (method, (at, values)) in enumerate(curves.items()):
         steps = np.asarray(at, dtype=np.float64)
         runs = np.asarray(values, dtype=np.float64)
         if steps.ndim != 1 or runs.ndim != 2 or runs.shape[1:] != steps.shape:
             raise ValueError(
-                f"arm {arm!r} has steps of shape {steps.shape} and values of shape "
-                f"{runs.shape}, wanted [P] and [R, P]"
+                f"method {method!r} has steps of shape {steps.shape} and values of "
+                f"shape {runs.shape}, expected [P] and [R, P]"
             )
         bands = [bootstrap_interval(run, confidence=confidence) for run in runs.T]
-        colour = _COLOURS[n % len(_COLOURS)]
         axes.plot(
             steps,
             runs.mean(0),
-            color=colour,
+            color=colour(n),
             linewidth=1.8,
             marker="o",
             markersize=3,
-            label=labels.get(arm, _label(arm)),
+            label=labels.get(method, name_label(method)),
             zorder=3,
         )
         low, high = np.reshape(bands, (-1, 2)).T
-        axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
-    _plain(axes)
+        axes.fill_between(steps, low, high, color=colour(n), alpha=0.15, linewidth=0)
     axes.set_xlabel(xlabel)
-    axes.set_ylabel(ylabel)
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    axes.grid(axis="y", color="#E5E5E5", linewidth=0.8)
-    figure.legend(
-        loc="outside lower center", ncols=min(len(curves), 4), frameon=False, fontsize=9
-    )
-    if title:
-        axes.set_title(title, fontsize=11, loc="left")
-    return figure
+    return finish_results(figure, axes, methods=len(curves), ylabel=ylabel, title=title)
 
 
 def plot_frames(
@@ -511,40 +523,47 @@ def plot_frames(
     columns: int | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw frames side by side (Fig. 1: a demonstration beside its counterfactuals).
+    """Plots frames next to each other (Fig. 1: a demonstration and counterfactuals).
 
     Args:
-        frames: RGB images ``[F, H, W, 3]``, uint8, or floats in [0, 1].
-        titles: one a frame.
+        frames (array-like): RGB images ``[F, H, W, 3]``, uint8, or floats in [0, 1].
+        titles (sequence of str, optional): the title of each frame. Defaults to
+            ``None``: no titles.
 
     Keyword Args:
-        columns: frames a line; all in one line by default.
-        title: of the figure.
+        columns (int, optional): the number of frames in a line. Defaults to ``None``:
+            all in one line.
+        title (str): the title of the figure. Defaults to ``""``.
 
     Returns:
-        the figure.
+        matplotlib.figure.Figure: the figure.
 
-    Example:
+    Raises:
+        ValueError: there are no frames, or a shape or a number is wrong.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_caiac.plotting import plot_frames
         >>> figure = plot_frames(np.zeros((3, 24, 32, 3), np.uint8), ["a", "b", "c"])
         >>> [axes.get_title() for axes in figure.axes]
         ['a', 'b', 'c']
     """
     images = [np.asarray(frame) for frame in frames]  # type: ignore[union-attr]
     if not images:
-        raise ValueError("frames are empty")
+        raise ValueError("frames are empty, expected at least one image")
     for i, image in enumerate(images):
         if image.ndim != 3 or image.shape[-1] != 3:
-            raise ValueError(f"frame {i} has shape {image.shape}, wanted [H, W, 3]")
+            raise ValueError(f"frame {i} has shape {image.shape}, expected [H, W, 3]")
     if titles is not None and len(titles) != len(images):
         raise ValueError(f"{len(titles)} titles for {len(images)} frames")
     if columns is not None and columns < 1:
-        raise ValueError(f"columns is {columns}, wanted at least 1")
+        raise ValueError(f"columns is {columns}, expected at least 1")
     columns = min(columns or len(images), len(images))
     rows = -(-len(images) // columns)
     height, width = images[0].shape[:2]
-    scale = 2.3 if columns > 2 else 3.2  # inches a frame
+    scale = 2.3 if columns > 2 else 3.2  # inches for each frame
     head = 0.22 if titles is not None else 0.0
-    figure = _figure(
+    figure = new_figure(
         scale * columns,
         rows * (scale * height / width + head) + (0.25 if title else 0.0),
         pad=0.02,

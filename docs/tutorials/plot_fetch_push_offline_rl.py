@@ -202,7 +202,7 @@ shown = slice(100 * episode, 100 * episode + 100)
 figure = plot_influence(
     score[shown].numpy(),
     layout.names,
-    truth=truth[shown].numpy(),
+    ground_truth=truth[shown].numpy(),
     threshold=THRESHOLD,
     exclude=["gripper"],
     step_seconds=env.dt,

@@ -134,7 +134,7 @@ shown = held_out["episode"] == 0
 figure = plot_influence(
     held_out["caiac", "score"][shown].numpy(),
     layout.names,
-    truth=truth[shown].numpy(),
+    ground_truth=truth[shown].numpy(),
     threshold=THRESHOLD,
     exclude=["robot"],
     step_seconds=0.08,

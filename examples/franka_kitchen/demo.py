@@ -75,7 +75,7 @@ def draw_influence(cfg: DictConfig, path: Path) -> None:
     plot_influence(
         data["caiac", "score"][rows].numpy(),
         KitchenEnv.layout.names,
-        truth=truth[rows].numpy(),
+        ground_truth=truth[rows].numpy(),
         threshold=cfg.score.threshold,
         exclude=["robot"],
         title="influence along a demonstration:\n" + ", ".join(names).replace("_", " "),
