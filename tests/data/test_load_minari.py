@@ -264,7 +264,7 @@ def test_episodes_of_different_kinds(spoil, key, tmp_path):
         (narrow_action, r"episode 1 .*differ.*\['action'\]"),
         (nan_observation, "'observation' in episode 1 .*NaN"),
         (inf_action, "'action' in episode 2 .*infinite"),
-        (missing_state, "'observation' in episode 2 .*has 6 entries, wanted 7"),
+        (missing_state, "'observation' in episode 2 .*has 6 entries, expected 7"),
     ],
 )
 def test_bad_episodes_leave_nothing(spoil, match, tmp_path):
@@ -285,7 +285,7 @@ def test_arguments(tmp_path):
     dataset, _ = make_dataset(flat)
     with pytest.raises(KeyError, match=r"no 'force' in its infos.*clock"):
         load_minari(dataset, tmp_path / "rows", infos=["force"], progress=False)
-    with pytest.raises(ValueError, match=r"columns reach from 0 to 3.*3 columns"):
+    with pytest.raises(ValueError, match=r"columns range from 0 to 3.*3 columns"):
         load_minari(dataset, tmp_path / "rows", columns=[0, 3], progress=False)
     load_minari(dataset, tmp_path / "rows", progress=False)
     with pytest.raises(FileExistsError, match="overwrite=True"):

@@ -50,9 +50,9 @@ def test_a_truncated_file_is_noticed_and_left_as_it_is(name, size, tmp_path):
     rows().memmap(tmp_path / "data")
     file = tmp_path / "data" / f"{name}.memmap"
     file.write_bytes((file.read_bytes() * 200)[:size])
-    with pytest.raises(ValueError, match=f"has {size} bytes, wanted") as error:
+    with pytest.raises(ValueError, match=f"has {size} bytes, expected") as error:
         load_transitions(tmp_path / "data")
-    assert "make the data again" in str(error.value)
+    assert "create the data again" in str(error.value)
     assert file.stat().st_size == size
 
 
@@ -68,20 +68,20 @@ def test_a_missing_file(name, tmp_path):
 def test_a_foreign_meta_file(text, tmp_path):
     rows().memmap(tmp_path / "data")
     (tmp_path / "data/meta.json").write_text(text)
-    with pytest.raises(ValueError, match="truncated or foreign"):
+    with pytest.raises(ValueError, match="truncated or not from tensordict"):
         load_transitions(tmp_path / "data")
 
 
 def test_another_batch_size(tmp_path):
     rows().reshape(2, 3).memmap(tmp_path / "data")
-    with pytest.raises(ValueError, match=r"batch size \[2, 3\], wanted \[T\]"):
+    with pytest.raises(ValueError, match=r"batch size \[2, 3\], expected \[T\]"):
         load_transitions(tmp_path / "data")
 
 
 def test_missing_folders_and_keys(tmp_path):
-    with pytest.raises(FileNotFoundError, match="there is no folder"):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
         load_transitions(tmp_path / "absent")
-    with pytest.raises(ValueError, match="no memory-mapped tensordict"):
+    with pytest.raises(ValueError, match="not a memory-mapped tensordict"):
         load_transitions(tmp_path)
     rows().exclude("episode").memmap(tmp_path / "data")
     with pytest.raises(ValueError, match=r"lacks \['episode'\]"):
@@ -95,5 +95,5 @@ def test_an_unknown_dtype_is_not_guessed(tmp_path):
     content = json.loads(meta.read_text())
     content["action"]["shape"] = [6, 3]
     meta.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="wanted 72"):
+    with pytest.raises(ValueError, match="expected 72"):
         load_transitions(tmp_path / "data")

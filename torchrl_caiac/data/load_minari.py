@@ -1,4 +1,4 @@
-"""Any Minari dataset as TorchRL transitions in memory-mapped files."""
+"""Minari datasets as TorchRL transitions in memory-mapped files."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tqdm.auto import tqdm
 
+from torchrl_caiac._files import whole_folder
 from torchrl_caiac.data.load_transitions import load_transitions
-from torchrl_caiac.data.minari_files import whole_folder
+from torchrl_caiac.data.write_transitions import check_free
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["load_minari"]
 
-# What an observation's entries must not be called.
+# The names that entries of an observation must not have.
 _TAKEN = {"action", "done", "episode", "info", "next"}
 _TAKEN |= {"reward", "terminated", "truncated"}
 
@@ -37,62 +38,75 @@ def load_minari(
 ) -> TensorDict:
     """Writes a Minari dataset as TorchRL transitions, and opens them.
 
-    Rows ``[T]`` hold ``"observation"``, ``"action"``, ``"episode"`` (int64 ``[]``, the
-    trajectory's number) and, under ``"next"``, the observation that followed (the
-    episode's own last one at its end), ``"reward"``, ``"terminated"``,
-    ``"truncated"`` and ``"done"`` (``[1]``). An episode's last row is always done: it
-    counts as truncated where the file has no flag.
+    The transitions ``[T]`` have ``"observation"``, ``"action"``, ``"episode"`` (the
+    number of the trajectory, int64 ``[T]``) and, under ``"next"``, the observation
+    after the action, ``"reward"``, ``"terminated"``, ``"truncated"`` and ``"done"``
+    (each ``[T, 1]``). The last row of an episode is always done: it counts as truncated
+    if the dataset has no flag for it.
 
-    A dict of observations becomes keys at the root if it has an ``"observation"``, as
-    those of a goal environment, whatever else it has; other dicts lie under
-    ``"observation"``. Floating-point numbers become float32.
+    If the observation is a dict with the entry ``"observation"``, as in goal
+    environments, its entries become entries of the root. Any other dict becomes a
+    nested ``"observation"``. Floating-point numbers become float32.
 
     Args:
-        dataset (str or MinariDataset): the dataset, or its id.
-        path (str or Path): the folder to write, which appears whole or not at all.
+        dataset (str or MinariDataset): the dataset or its id.
+        path (str or Path): the folder to write. It is written atomically.
 
     Keyword Args:
-        download (bool): fetch a dataset that is not there. Defaults to ``False``.
-        columns (sequence of int, optional): keep these columns of the observation
-            (of the entry ``"observation"`` of a goal environment).
-        infos (sequence of str): entries of the episodes' infos to keep, under
-            ``"info"``, as they are: row ``t`` holds that of its state.
-        overwrite (bool): replace what is at ``path``. Defaults to ``False``.
-        progress (bool): show a progress bar over the episodes. Defaults to ``True``.
+        download (bool): whether to download a missing dataset. Defaults to ``False``.
+        columns (sequence of int, optional): the columns of the observation to keep
+            (in goal environments, of the entry ``"observation"``). Defaults to
+            ``None``: all.
+        infos (sequence of str): the entries of the episodes' infos to keep, unchanged,
+            under ``"info"``. Row ``t`` has the info of its state. Defaults to ``()``.
+        overwrite (bool): whether to replace ``path`` if it exists. Defaults to
+            ``False``.
+        progress (bool): whether to show a progress bar over the episodes. Defaults to
+            ``True``.
 
     Returns:
-        TensorDict: the memmap tensordict, ``[T]``.
+        TensorDict: the memory-mapped transitions, ``[T]``.
 
     Raises:
-        FileExistsError: there is something at ``path``.
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         FileNotFoundError: the dataset is not on this machine.
-        ValueError: the dataset is empty; an episode is empty, does not fit together,
-            or holds NaN or infinities; ``columns`` do not fit.
         KeyError: an episode lacks one of ``infos``.
+        ValueError: the dataset is empty; an episode is empty, inconsistent, or has NaN
+            or infinite values; ``columns`` do not fit the observation.
 
     Examples:
-        >>> import tempfile
+        >>> import os, tempfile
+        >>> import minari
+        >>> import numpy as np
+        >>> from gymnasium.spaces import Box
+        >>> from minari.data_collector import EpisodeBuffer
         >>> from torchrl_caiac.data import load_minari
-        >>> from torchrl_caiac.envs import create_fetch_push_random
         >>> folder = tempfile.TemporaryDirectory()
-        >>> dataset = create_fetch_push_random(
-        ...     episodes=2, steps=5, root=folder.name, workers=1, progress=False
+        >>> os.environ["MINARI_DATASETS_PATH"] = folder.name
+        >>> episode = EpisodeBuffer(
+        ...     observations=np.zeros((6, 3)),
+        ...     actions=np.zeros((5, 2)),
+        ...     rewards=np.zeros(5),
+        ...     terminations=np.zeros(5, bool),
+        ...     truncations=np.zeros(5, bool),
         ... )
-        >>> rows = load_minari(dataset, f"{folder.name}/rows", progress=False)
-        >>> rows["episode"]
+        >>> dataset = minari.create_dataset_from_buffers(
+        ...     "example/zeros-v0",
+        ...     [episode, episode],
+        ...     observation_space=Box(-1, 1, (3,)),
+        ...     action_space=Box(-1, 1, (2,)),
+        ... )
+        >>> data = load_minari(dataset, f"{folder.name}/data", progress=False)
+        >>> data["episode"]
         MemoryMappedTensor([0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
-        >>> rows["next", "observation"].shape
-        torch.Size([10, 34])
+        >>> data["next", "observation"].shape
+        torch.Size([10, 3])
+        >>> del os.environ["MINARI_DATASETS_PATH"]
         >>> folder.cleanup()
     """
     import minari
 
-    path = Path(path)
-    if path.exists() and not overwrite:
-        raise FileExistsError(
-            f"there is something at {path}: open it with load_transitions, or pass "
-            "overwrite=True to replace it"
-        )
+    check_free(path, overwrite)
     if isinstance(dataset, str):
         dataset = minari.load_dataset(dataset, download=download)
     lengths = [
@@ -100,7 +114,7 @@ def load_minari(
         for meta in dataset.storage.get_episode_metadata(dataset.episode_indices)
     ]
     if not sum(lengths):
-        raise ValueError(f"the dataset {dataset.id} has no steps")
+        raise ValueError(f"the dataset {dataset.id} has no steps: give another one")
     with whole_folder(path) as folder:
         _fill(dataset, lengths, folder, columns, infos, progress)
     return load_transitions(path)
@@ -129,12 +143,12 @@ def _fill(
         part["episode"] = torch.full((length,), number)
         if rows is None:
             rows = part[:1].expand(sum(lengths)).memmap_like(folder)
-        # A memmap would broadcast, cast or leave out what does not fit, silently.
+        # A memmap silently broadcasts, casts or ignores entries that do not fit.
         differ = {leaf[0] for leaf in _structure(part) ^ _structure(rows)}
         if differ:
             raise ValueError(
                 f"episode {episode.id} of {dataset.id} and the first one differ in the "
-                f"shapes or types of {sorted(differ, key=str)}: load them apart"
+                f"shapes or types of {sorted(differ, key=str)}: load them separately"
             )
         rows[first : first + length] = part
         first += length
@@ -177,8 +191,8 @@ def _transitions(
     for name in infos:
         if name not in (episode.infos or {}):
             raise KeyError(
-                f"{where} has no {name!r} in its infos, it has "
-                f"{sorted(episode.infos or {})}"
+                f"{where} has no {name!r} in its infos; it has "
+                f"{sorted(episode.infos or {})}: correct infos="
             )
         kept[name] = episode.infos[name]
     td = TensorDict(
@@ -208,11 +222,12 @@ def _columns(states: Mapping[str, Any], columns: Sequence[int], where: str) -> A
     observation = states["observation"]
     if isinstance(observation, Mapping) or observation.ndim != 2:
         raise ValueError(
-            f"{where} has no flat observation [L + 1, D] to take columns of"
+            f"{where} has no flat observation [L + 1, D] to take columns from: "
+            "leave out columns="
         )
     if min(columns) < 0 or max(columns) >= observation.shape[1]:
         raise ValueError(
-            f"columns reach from {min(columns)} to {max(columns)}, but {where} has "
+            f"columns range from {min(columns)} to {max(columns)}, but {where} has "
             f"{observation.shape[1]} columns"
         )
     return observation[:, list(columns)]
@@ -233,13 +248,14 @@ def _tensors(
             continue
         if isinstance(value, tuple):
             raise ValueError(
-                f"{key!r} in {where} is a tuple of spaces, which has no keys: make a "
-                "dict of it"
+                f"{key!r} in {where} is a tuple of spaces, which has no keys: "
+                "convert it to a dict"
             )
         array = np.asarray(value)
         if len(array) != length:
             raise ValueError(
-                f"{key!r} in {where} has {len(array)} entries, wanted {length}"
+                f"{key!r} in {where} has {len(array)} entries, expected {length}: "
+                "remove the episode"
             )
         if np.issubdtype(array.dtype, np.floating):
             with np.errstate(over="ignore"):
@@ -247,8 +263,8 @@ def _tensors(
             if not np.isfinite(array).all():
                 raise ValueError(
                     f"{key!r} in {where} has NaN or infinite values (as float32): "
-                    "leave the episode out, say with MinariDataset.filter_episodes"
+                    "remove the episode with MinariDataset.filter_episodes"
                 )
-        # A copy: what Minari hands out may be read-only.
+        # Copied, because Minari may return read-only arrays.
         result[key] = torch.from_numpy(np.array(array[part]))
     return result

@@ -1,4 +1,4 @@
-"""Opens a folder of transitions, and notices when it is not whole."""
+"""Opens a folder of transitions, after checking that it is complete."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._keys import leaf_names
 from torchrl_caiac._torchrl import file_name, mark_memmap
 
 __all__ = ["load_transitions"]
@@ -24,26 +25,27 @@ def load_transitions(
 ) -> TensorDict:
     """Opens a memory-mapped tensordict of flat transitions.
 
-    ``TensorDict.load_memmap`` fills what a truncated file lacks with zeros, in the data
-    and on disk. This checks the size of every file first, and returns a tensordict that
-    knows that it is memory-mapped, so that leaves can be added to it.
+    ``TensorDict.load_memmap`` fills the missing part of a truncated file with zeros, in
+    the data and on disk. This function checks the size of every file first. The
+    tensordict it returns is marked as memory-mapped, so that leaves can be added to it.
 
     Args:
-        path (str or Path): the folder, of :func:`load_minari` or of any
-            ``tensordict.memmap(path)`` with one batch dimension.
+        path (str or Path): the folder, as written by
+            :func:`~torchrl_caiac.data.load_minari` or by ``tensordict.memmap(path)``
+            with one batch dimension.
 
     Keyword Args:
-        keys (iterable of NestedKey): what the data must have. Defaults to ``"action"``,
-            ``"episode"`` and ``("next", "done")``.
+        keys (iterable of NestedKey): the keys that the data must have. Defaults to
+            ``"action"``, ``"episode"`` and ``("next", "done")``.
 
     Returns:
-        TensorDict: the rows, ``[T]``, memory-mapped and locked. Writing into a leaf
-        writes to disk.
+        TensorDict: the transitions, ``[T]``, memory-mapped and locked. Writing to a
+        leaf writes to disk.
 
     Raises:
-        FileNotFoundError: there is no such folder.
-        ValueError: the folder is no memory-mapped tensordict, is truncated, has no rows
-            or several batch dimensions, or lacks a key.
+        FileNotFoundError: the folder does not exist.
+        ValueError: the folder is not a memory-mapped tensordict, is truncated, has no
+            rows or several batch dimensions, or lacks a key.
 
     Examples:
         >>> import tempfile
@@ -59,42 +61,41 @@ def load_transitions(
     path = Path(path)
     if not path.is_dir():
         raise FileNotFoundError(
-            f"there is no folder {path}: make the data first, for instance with "
-            "load_minari"
+            f"the folder {path} does not exist: create the data first, for example "
+            "with load_minari"
         )
     shape = _check_folder(path, path)
     if len(shape) != 1 or not shape[0]:
         raise ValueError(
-            f"{path} has the batch size {shape}, wanted [T] with at least one row: "
-            "store flat transitions"
+            f"{path} has batch size {shape}, expected [T] with at least one row: store "
+            "flat transitions"
         )
     data = TensorDict.load_memmap(path)
     missing = [key for key in keys if data.get(key, None) is None]
     if missing:
-        found = sorted(map(str, data.keys(include_nested=True, leaves_only=True)))
         raise ValueError(
-            f"{path} lacks {missing}, it has {found}: it holds something else, or was "
-            "made with other keys"
+            f"{path} lacks {missing}, it has {leaf_names(data)}: give another folder, "
+            "or pass keys="
         )
     mark_memmap(data)
     return data.lock_()
 
 
 def _check_folder(folder: Path, root: Path) -> list[int]:
-    """Checks that every leaf has its file at full length; returns the batch size."""
+    """Checks that the file of every leaf is complete, and returns the batch size."""
     meta = folder / "meta.json"
-    again = "delete the folder and make the data again"
+    again = "delete the folder and create the data again"
     if not meta.exists():
         raise ValueError(
-            f"{root} is no memory-mapped tensordict, {meta} is missing: give another "
-            f"folder, or {again}"
+            f"{root} is not a memory-mapped tensordict, {meta} is missing: give "
+            f"another folder, or {again}"
         )
     try:
         content = json.loads(meta.read_text(encoding="utf-8"))
         shape = [int(size) for size in content["shape"]]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
-            f"{meta} is truncated or foreign ({error}): {again}"
+            f"{meta} is truncated or not from tensordict ({error}): {again}"
         ) from error
     for key, entry in content.items():
         if not isinstance(entry, dict):
@@ -106,13 +107,12 @@ def _check_folder(folder: Path, root: Path) -> list[int]:
             continue
         file = folder / f"{name}.memmap"
         if not file.exists():
-            raise ValueError(f"{root} is not whole, {file} is missing: {again}")
-        wanted = _bytes(entry)
-        if wanted is not None and file.stat().st_size != wanted:
+            raise ValueError(f"{root} is incomplete, {file} is missing: {again}")
+        expected = _bytes(entry)
+        if expected is not None and file.stat().st_size != expected:
             raise ValueError(
-                f"{file} has {file.stat().st_size} bytes, wanted {wanted} "
-                f"({entry['dtype']} {entry['shape']}): it is truncated or foreign, "
-                f"{again}"
+                f"{file} has {file.stat().st_size} bytes, expected {expected} "
+                f"({entry['dtype']} {entry['shape']}): {again}"
             )
     return shape
 

@@ -1,59 +1,47 @@
-"""Local Minari datasets: where they lie, and how they are written whole or not at all.
-
-Shared by the dataset creators of :mod:`torchrl_caiac.envs`.
-"""
+"""Local Minari datasets: their folders, and writing them atomically."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from torchrl_caiac.data.load_transitions import load_transitions
+from torchrl_caiac._files import whole_folder
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
-    from tensordict import TensorDict
 
 __all__ = [
     "dataset_path",
     "free_dataset_path",
-    "index_tree",
     "open_minari",
     "publish_dataset",
-    "stack_trees",
-    "whole_folder",
     "work_folder",
-    "write_rows",
 ]
-
-_PARTIAL = ".partial-"
 
 
 def dataset_path(dataset_id: str, root: str | os.PathLike[str] | None = None) -> Path:
-    """Return the folder of a Minari dataset.
+    """Returns the folder of a Minari dataset.
 
     Args:
-        dataset_id: Minari's name of the dataset.
-        root: folder of Minari datasets; `MINARI_DATASETS_PATH` or Minari's own where
-            None.
+        dataset_id (str): the id of the dataset.
+        root (path, optional): the folder of all Minari datasets. Defaults to ``None``:
+            ``MINARI_DATASETS_PATH``, or the default of Minari.
 
     Returns:
-        the folder, which need not exist.
+        Path: the folder, which need not exist.
 
-    Example:
-        >>> dataset_path("kitchen/play-v0", "/data").as_posix()
-        '/data/kitchen/play-v0'
+    Examples:
+        >>> from torchrl_caiac.data.minari_files import dataset_path
+        >>> dataset_path("push/play-v0", "/data").as_posix()
+        '/data/push/play-v0'
     """
     if root is not None:
-        # Minari loses its way from a relative one.
+        # Minari does not support relative paths.
         return Path(root).absolute() / dataset_id
     from minari.storage import get_dataset_path
 
@@ -61,26 +49,35 @@ def dataset_path(dataset_id: str, root: str | os.PathLike[str] | None = None) ->
 
 
 def free_dataset_path(
-    dataset_id: str, root: str | os.PathLike[str] | None, overwrite: bool
+    dataset_id: str,
+    root: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
 ) -> Path:
-    """Return the folder of a dataset that is to be written.
+    """Returns the folder of a Minari dataset to write, after checking that it is free.
 
     Args:
-        dataset_id: Minari's name of the dataset.
-        root: see :func:`dataset_path`.
-        overwrite: whether there may be one already.
+        dataset_id (str): the id of the dataset.
+        root (path, optional): as in :func:`dataset_path`. Defaults to ``None``.
+        overwrite (bool): whether the dataset may exist. Defaults to ``False``.
 
     Returns:
-        the folder.
+        Path: the folder.
 
     Raises:
-        FileExistsError: there is a dataset of that name and `overwrite` is False.
+        FileExistsError: the dataset exists and ``overwrite`` is ``False``.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac.data.minari_files import free_dataset_path
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     free_dataset_path("push/play-v0", root).name
+        'play-v0'
     """
     target = dataset_path(dataset_id, root)
     if target.exists() and not overwrite:
         raise FileExistsError(
-            f"there is a dataset {dataset_id!r} at {target}; pass overwrite=True to "
-            "replace it"
+            f"the dataset {dataset_id!r} exists at {target}: give another id, or pass "
+            "overwrite=True to replace it"
         )
     return target
 
@@ -91,20 +88,30 @@ def open_minari(
     *,
     download: bool = False,
 ) -> MinariDataset:
-    """Open a Minari dataset.
+    """Opens a Minari dataset.
 
     Args:
-        dataset_id: Minari's name of the dataset.
-        root: see :func:`dataset_path`.
+        dataset_id (str): the id of the dataset.
+        root (path, optional): as in :func:`dataset_path`. Defaults to ``None``.
 
     Keyword Args:
-        download: fetch a dataset that is not there, to where it is looked for.
+        download (bool): whether to download a missing dataset, into ``root``. Defaults
+            to ``False``.
 
     Returns:
-        the dataset.
+        MinariDataset: the dataset.
 
     Raises:
-        FileNotFoundError: there is none of that name.
+        FileNotFoundError: the dataset does not exist.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac.data.minari_files import open_minari
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     open_minari("push/play-v0", root)
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: no Minari dataset 'push/play-v0' in ...
     """
     import minari
 
@@ -114,16 +121,15 @@ def open_minari(
             minari.download_dataset(dataset_id)
     if not data.exists():
         raise FileNotFoundError(
-            f"no Minari dataset {dataset_id!r} at {data.parent}; collect it first, "
-            "pass download=True where there is a network, or say where it is with "
-            "root= or MINARI_DATASETS_PATH"
+            f"no Minari dataset {dataset_id!r} in {data.parent}: collect it first, "
+            "pass download=True, or give its place by root= or MINARI_DATASETS_PATH"
         )
     return minari.MinariDataset(data)
 
 
 @contextlib.contextmanager
 def _datasets_in(root: str | os.PathLike[str] | None) -> Iterator[None]:
-    """Let Minari's own functions work in a folder; where they do anyway for None."""
+    """Sets the folder that Minari's functions use; ``None`` changes nothing."""
     previous = os.environ.get("MINARI_DATASETS_PATH")
     if root is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(Path(root).absolute())
@@ -138,14 +144,21 @@ def _datasets_in(root: str | os.PathLike[str] | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def work_folder(work: str | os.PathLike[str] | None, dataset_id: str) -> Iterator[Path]:
-    """Give a folder for the episodes of a collection, temporary where None is named.
+    """Context manager that provides a folder for the episodes of a collection.
 
     Args:
-        work: where several collections keep theirs.
-        dataset_id: Minari's name of the dataset that is collected.
+        work (path, optional): the folder of several collections, to resume an
+            interrupted one. ``None``: a temporary folder.
+        dataset_id (str): the id of the dataset to collect.
 
     Yields:
-        the collection's own folder.
+        Path: the folder of this collection.
+
+    Examples:
+        >>> from torchrl_caiac.data.minari_files import work_folder
+        >>> with work_folder("/work", "push/play-v0") as folder:
+        ...     folder.as_posix()
+        '/work/push-play-v0'
     """
     if work is not None:
         yield Path(work) / dataset_id.replace("/", "-")
@@ -161,150 +174,90 @@ def publish_dataset(
     make_env: Callable[[], Any],
     *,
     code: str,
+    requirements: Sequence[str],
     progress: bool,
     description: str,
     algorithm_name: str,
 ) -> MinariDataset:
-    """Write a dataset beside its place and move it there when it is whole.
+    """Writes a Minari dataset, atomically.
 
     Args:
-        dataset_id: Minari's name of the dataset.
-        buffers: the episodes.
-        target: of :func:`free_dataset_path`; what is there is replaced.
-        make_env: makes the environment that Minari keeps the specification of.
+        dataset_id (str): the id of the dataset.
+        buffers (iterable of EpisodeBuffer): the episodes.
+        target (Path): the folder, as returned by :func:`free_dataset_path`. It is
+            replaced if it exists.
+        make_env (callable): creates the environment, whose specification Minari stores.
 
     Keyword Args:
-        code: the file that collected it.
-        progress: show a progress bar.
-        description: what the dataset holds.
-        algorithm_name: what acted.
+        code (str): the file that collected the dataset.
+        requirements (sequence of str): the packages that the environment needs, as in a
+            requirements file.
+        progress (bool): whether to show a progress bar.
+        description (str): the content of the dataset.
+        algorithm_name (str): the policy that acted.
 
     Returns:
-        the dataset.
+        MinariDataset: the dataset.
+
+    Examples:
+        >>> import tempfile
+        >>> import gymnasium
+        >>> import numpy as np
+        >>> from minari.data_collector import EpisodeBuffer
+        >>> from torchrl_caiac.data import minari_files
+        >>> episode = EpisodeBuffer(
+        ...     observations=np.zeros((3, 4), np.float32),
+        ...     actions=np.zeros(2, int),
+        ...     rewards=np.zeros(2),
+        ...     terminations=np.zeros(2, bool),
+        ...     truncations=np.array([False, True]),
+        ... )
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     dataset = minari_files.publish_dataset(
+        ...         "pole/rest-v0",
+        ...         [episode],
+        ...         minari_files.free_dataset_path("pole/rest-v0", root),
+        ...         lambda: gymnasium.make("CartPole-v1"),
+        ...         code="examples/collect.py",
+        ...         requirements=["gymnasium>=1"],
+        ...         progress=False,
+        ...         description="A pole at rest.",
+        ...         algorithm_name="none",
+        ...     )
+        ...     dataset.total_steps
+        2
     """
     import minari
     from minari import MinariDataset
     from tqdm import tqdm
 
-    place = target
-    for _ in Path(dataset_id).parts:
-        place = place.parent
-    place.mkdir(parents=True, exist_ok=True)
+    target.parent.mkdir(parents=True, exist_ok=True)
     env = make_env()
-    partial = Path(tempfile.mkdtemp(dir=place, prefix=_PARTIAL))
     try:
-        bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
-        with _datasets_in(partial):
-            minari.create_dataset_from_buffers(
-                dataset_id,
-                bar,
-                env=env,
-                eval_env=env,
-                algorithm_name=algorithm_name,
-                author="torchrl-caiac",
-                author_email="none",
-                code_permalink=code,
-                description=description,
-                requirements=["gymnasium-robotics>=1.4,<1.5", "mujoco>=3.1,<3.12"],
-            )
-        built = partial / dataset_id
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # Minari describes a namespace in a file of its own.
-        for extra in built.parent.iterdir():
-            if extra.is_file() and not (target.parent / extra.name).exists():
-                os.replace(extra, target.parent / extra.name)
-        _swap(built, target, partial / "replaced")
+        with tempfile.TemporaryDirectory(
+            dir=target.parent, prefix=".partial-"
+        ) as partial:
+            bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
+            with _datasets_in(partial):
+                minari.create_dataset_from_buffers(
+                    dataset_id,
+                    bar,
+                    env=env,
+                    eval_env=env,
+                    algorithm_name=algorithm_name,
+                    author="torchrl-caiac",
+                    author_email="none",
+                    code_permalink=code,
+                    description=description,
+                    requirements=list(requirements),
+                )
+            built = Path(partial) / dataset_id
+            # Minari stores the description of a namespace in a separate file.
+            for extra in built.parent.iterdir():
+                if extra.is_file() and not (target.parent / extra.name).exists():
+                    os.replace(extra, target.parent / extra.name)
+            with whole_folder(target) as made:
+                os.replace(built, made)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
         env.close()
     return MinariDataset(target / "data")
-
-
-@contextlib.contextmanager
-def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a folder to make, which is moved to its place when the block ends well.
-
-    Args:
-        path: the place; what is there is replaced then.
-
-    Yields:
-        a folder beside it that does not exist yet.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
-    try:
-        yield partial / "rows"
-        _swap(partial / "rows", path, partial / "replaced")
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _swap(made: Path, place: Path, replaced: Path) -> None:
-    """Move what was made to its place, and what was there before out of the way."""
-    there = place.exists()
-    if there:
-        os.replace(place, replaced)
-    try:
-        os.replace(made, place)
-    except OSError:
-        if there:
-            os.replace(replaced, place)
-        raise
-
-
-def write_rows(rows: TensorDict, path: str | os.PathLike[str]) -> TensorDict:
-    """Write rows to a folder, which appears whole or not at all, and open them.
-
-    Args:
-        rows: transitions `[T]`.
-        path: the folder; what is there is replaced.
-
-    Returns:
-        the memory-mapped rows.
-    """
-    with whole_folder(path) as folder:
-        rows.memmap(folder)
-    return load_transitions(Path(path))
-
-
-def stack_trees(trees: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Stack nested arrays of equal structure, `[*]` each, to `[M, *]`.
-
-    Args:
-        trees: `M` mappings of names to arrays or mappings.
-
-    Returns:
-        one such mapping.
-
-    Example:
-        >>> stack_trees([{"a": 1}, {"a": 2}])
-        {'a': array([1, 2])}
-    """
-    return {
-        key: stack_trees([tree[key] for tree in trees])
-        if isinstance(value, Mapping)
-        else np.stack([tree[key] for tree in trees])
-        for key, value in trees[0].items()
-    }
-
-
-def index_tree(tree: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Return the entry of nested arrays at an index, what :func:`stack_trees` undid.
-
-    Args:
-        tree: mapping of names to arrays `[M, *]` or mappings.
-        index: which of the `M`.
-
-    Returns:
-        the same mapping with arrays `[*]`.
-
-    Example:
-        >>> import numpy as np
-        >>> index_tree({"a": np.array([1, 2])}, 1)["a"].item()
-        2
-    """
-    return {
-        key: index_tree(value, index) if isinstance(value, Mapping) else value[index]
-        for key, value in tree.items()
-    }

@@ -1,4 +1,4 @@
-"""Mixtures of datasets in given shares and sizes, by whole trajectories."""
+"""Mixtures of datasets, by whole trajectories, with given shares and sizes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._files import whole_folder
+from torchrl_caiac._keys import get_leaf
+from torchrl_caiac._keys import path as key_path
 from torchrl_caiac.data.load_transitions import load_transitions
-from torchrl_caiac.data.minari_files import whole_folder
-from torchrl_caiac.entities import _path
+from torchrl_caiac.data.write_transitions import check_free
+from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 
 __all__ = ["mix_trajectories"]
 
@@ -35,53 +38,56 @@ def mix_trajectories(
     source_trajectory_key: NestedKey = "source_episode",
     overwrite: bool = False,
 ) -> TensorDict:
-    """Draws whole trajectories from several datasets, in given shares.
+    """Draws whole trajectories from several datasets, with given shares.
 
-    The paper's Fetch-Push data are 30 % expert and 70 % random episodes, learnt from
-    whole, to 20 % and to 10 % (A.3.1). All trajectories that a mixture can have are
-    put in one random order in which every beginning keeps the shares as well as whole
-    trajectories allow; ``trajectories`` and ``fraction`` say how much of the beginning
-    is taken. So of two mixtures with the same sources, shares and seed, the smaller one
-    is the beginning of the larger one. Rows keep their order within a trajectory.
+    For example, the Fetch-Push data of the paper are 30 % expert and 70 % random
+    episodes, of which learners get 100 %, 20 % or 10 % (A.3.1).
 
-    The rows' leaves are those of the sources, and:
+    All trajectories that a mixture can have are put in one random order, in which every
+    prefix has the given shares as exactly as whole trajectories allow. The mixture is a
+    prefix of this order, whose length is ``fraction * trajectories``. Hence, of two
+    mixtures with the same sources, shares and seed, the smaller one is a prefix of the
+    larger one. The rows of a trajectory keep their order.
 
-    - ``trajectory_key``: renumbered 0, 1, ... in the order of the rows, int64;
-    - ``source_key``: the position in ``sources`` that a row came from, int64 ``[]``;
-    - ``source_trajectory_key``: the trajectory's id there.
+    The result has the leaves of the sources, and:
+
+    - ``trajectory_key``: new trajectory ids 0, 1, ... in the order of the rows, int64;
+    - ``source_key``: the position in ``sources`` of the dataset that a row comes from,
+      int64 ``[T']``;
+    - ``source_trajectory_key``: the trajectory id in that dataset.
 
     Args:
         sources (sequence of TensorDictBase): transitions ``[T]``, in memory or
-            memory-mapped, with the same keys, dtypes and shapes behind ``T``. The rows
-            of a trajectory lie one after another.
+            memory-mapped, with the same keys, dtypes and shapes after ``T``. The rows
+            of a trajectory are consecutive.
 
     Keyword Args:
-        shares (sequence of float, optional): share of each source in the mixture's
-            trajectories; positive, sum 1. Defaults to ``None``: whatever share each
-            source's trajectories have among all.
-        fraction (float): how much of the mixture is taken, in (0, 1]. Defaults to
+        shares (sequence of float, optional): the share of each source in the
+            trajectories of the mixture; positive, sum 1. Defaults to ``None``: the
+            share of each source in all trajectories.
+        fraction (float): the part of the mixture to take, in (0, 1]. Defaults to
             ``1.0``.
-        trajectories (int, optional): trajectories of the whole mixture. Defaults to
-            ``None``: the most of which no source's share is more than it has.
-        seed (int): seed of the draw. Defaults to ``0``.
-        path (str or Path, optional): folder for a memory-mapped result, which appears
-            whole or not at all; it is filled leaf by leaf. Defaults to ``None``: in
-            memory.
-        trajectory_key (NestedKey): the trajectory ids, ``[T]`` or ``[T, 1]``. Defaults
-            to ``"episode"``.
+        trajectories (int, optional): the number of trajectories of the whole mixture.
+            Defaults to ``None``: the largest number that the sources allow.
+        seed (int): the seed of the draw. Defaults to ``0``.
+        path (str or Path, optional): the folder of a memory-mapped result. It is
+            written leaf by leaf and atomically. Defaults to ``None``: in memory.
+        trajectory_key (NestedKey): the key of the trajectory ids, ``[T]`` or
+            ``[T, 1]``. Defaults to ``"episode"``.
         source_key (NestedKey): see above. Defaults to ``"source"``.
         source_trajectory_key (NestedKey): see above. Defaults to ``"source_episode"``.
-        overwrite (bool): replace what is at ``path``. Defaults to ``False``.
+        overwrite (bool): whether to replace ``path`` if it exists. Defaults to
+            ``False``.
 
     Returns:
-        TensorDict: the rows, ``[T']``, locked where memory-mapped.
+        TensorDict: the rows, ``[T']``, locked if memory-mapped.
 
     Raises:
-        FileExistsError: there is something at ``path``.
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         KeyError: a source lacks ``trajectory_key``.
-        ValueError: sources differ in their leaves, have none, or have trajectories in
-            pieces; ``shares``, ``fraction`` or ``trajectories`` are out of range or ask
-            for more trajectories than there are.
+        ValueError: the sources have different leaves, none, or trajectories whose rows
+            are not consecutive; ``shares``, ``fraction`` or ``trajectories`` are out of
+            range or need more trajectories than the sources have.
 
     Examples:
         >>> import torch
@@ -96,27 +102,23 @@ def mix_trajectories(
         >>> len(rows), (rows["source"] == 0).float().mean()  # 20 trajectories
         (100, tensor(0.3000))
     """
-    if path is not None and Path(path).exists() and not overwrite:
-        raise FileExistsError(
-            f"there is something at {path}: open it with load_transitions, or pass "
-            "overwrite=True to replace it"
-        )
+    check_free(path, overwrite)
     new = (source_key, source_trajectory_key)
     _check_sources(sources, new)
-    runs = [
-        _runs(source, trajectory_key, number) for number, source in enumerate(sources)
+    indices = [
+        _index(source, trajectory_key, number) for number, source in enumerate(sources)
     ]
     picks = _draw_trajectories(
-        [len(run.starts) for run in runs], shares, fraction, trajectories, seed
+        [len(index.ends) for index in indices], shares, fraction, trajectories, seed
     )
-    rows = _locate(runs, picks)
+    rows = _locate(indices, picks)
     logger.info(
-        "mixed %d trajectories, %d rows; of each source: %s",
+        "mixed %d trajectories with %d rows; trajectories of each source: %s",
         len(picks),
         len(rows.number),
         np.bincount(picks[:, 0], minlength=len(sources)).tolist(),
     )
-    # One row of the result, to be spread over its length without being read.
+    # One row of the result, expanded to allocate all of them.
     one = sources[0][:1].clone()
     ids = one.get(trajectory_key)
     one.set(source_trajectory_key, ids.clone())
@@ -134,20 +136,12 @@ def mix_trajectories(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Runs:
-    """The trajectories of a source: first rows `[E]` and lengths `[E]`."""
-
-    starts: torch.Tensor
-    lengths: torch.Tensor
-
-
-@dataclasses.dataclass(frozen=True)
 class _Rows:
-    """Where the rows of a mixture come from, int64 `[T']` each, on the CPU."""
+    """The origin of the rows of a mixture, int64 ``[T']`` each, on the CPU."""
 
-    number: torch.Tensor  # of the trajectory in the mixture
+    number: torch.Tensor  # the trajectory in the mixture
     source: torch.Tensor
-    row: torch.Tensor  # in the source
+    row: torch.Tensor  # the row in the source
 
 
 def _draw_trajectories(
@@ -157,11 +151,11 @@ def _draw_trajectories(
     trajectories: int | None,
     seed: int,
 ) -> np.ndarray:
-    """Draw the mixture's trajectories, pairs of source and trajectory in it `[E, 2]`.
+    """Draws the trajectories of a mixture, pairs of source and trajectory ``[E, 2]``.
 
-    The j-th trajectory of a source with share p comes at the place (j + 1/2) / p: the
-    method of Sainte-Laguë for seats in a parliament, in which nobody loses a seat when
-    there are more of them.
+    The j-th trajectory of a source with share p is at the position (j + 1/2) / p. This
+    is the method of Sainte-Laguë for seats in a parliament: no party loses a seat when
+    the number of seats grows.
     """
     if shares is None:
         parts = [count / sum(counts) for count in counts]
@@ -170,18 +164,18 @@ def _draw_trajectories(
         if len(parts) != len(counts):
             raise ValueError(
                 f"there are {len(parts)} shares {parts} for {len(counts)} sources: "
-                "give one for each"
+                "give one share for each source"
             )
-        # NaN is no positive number either.
+        # Written so that NaN fails too.
         if not all(part > 0 for part in parts) or not math.isclose(
             sum(parts), 1.0, abs_tol=1e-6
         ):
             raise ValueError(
-                f"shares are {parts}, sum {sum(parts):g}; wanted positive numbers with "
-                "sum 1: leave sources without a share out"
+                f"shares are {parts}, sum {sum(parts):g}; expected positive numbers "
+                "with sum 1: leave out sources without a share"
             )
     if not 0 < fraction <= 1:
-        raise ValueError(f"fraction is {fraction}, wanted above 0 and at most 1")
+        raise ValueError(f"fraction is {fraction}, expected above 0 and at most 1")
     places = [
         (np.arange(count + 1) + 0.5) / part
         for count, part in zip(counts, parts, strict=True)
@@ -189,40 +183,40 @@ def _draw_trajectories(
     end = min(place[-1] for place in places)
     order = np.concatenate([place[:-1] for place in places])
     who = np.repeat(np.arange(len(counts)), counts)
-    # Each source's stream has its own seed: another source's size changes nothing.
+    # Each source has a seed of its own, so the size of another changes nothing.
     which = np.concatenate(
         [
             np.random.default_rng([seed, number]).permutation(count)
             for number, count in enumerate(counts)
         ]
     )
-    # Rounding may be kind to the scarce source: not beyond what the shares give.
+    # Rounding must not take more of a source than its share allows.
     limit = min(count / part for count, part in zip(counts, parts, strict=True))
     most = min(int((order < end).sum()), math.floor(limit + 1e-6))
     if trajectories is None:
         trajectories = most
     if not 1 <= trajectories <= most:
         raise ValueError(
-            f"trajectories is {trajectories}, wanted 1 to {most}: the sources have "
+            f"trajectories is {trajectories}, expected 1 to {most}: the sources have "
             f"{list(counts)}, and the shares are {[round(part, 6) for part in parts]}"
         )
     taken = round(fraction * trajectories)
     if not taken:
         raise ValueError(
-            f"fraction {fraction} of {trajectories} trajectories is not a single one: "
-            "raise it"
+            f"fraction {fraction} of {trajectories} trajectories is less than one "
+            "trajectory: raise it"
         )
     first = np.argsort(order, kind="stable")[:taken]
     return np.stack([who[first], which[first]], 1)
 
 
-def _locate(runs: Sequence[_Runs], picks: np.ndarray) -> _Rows:
+def _locate(indices: Sequence[TrajectoryIndex], picks: np.ndarray) -> _Rows:
     who, which = torch.from_numpy(picks).unbind(1)
     starts, lengths = torch.empty_like(who), torch.empty_like(who)
-    for source, run in enumerate(runs):
+    for source, index in enumerate(indices):
         mine = who == source
-        starts[mine] = run.starts[which[mine]]
-        lengths[mine] = run.lengths[which[mine]]
+        starts[mine] = index.starts.cpu()[which[mine]]
+        lengths[mine] = index.lengths.cpu()[which[mine]]
     number = torch.arange(len(who)).repeat_interleave(lengths)
     step = torch.arange(len(number)) - (lengths.cumsum(0) - lengths)[number]
     return _Rows(number, who[number], starts[number] + step)
@@ -244,7 +238,7 @@ def _fill(
         places = (rows.source == number).nonzero().squeeze(1)
         taken = rows.row[places]
         for key in keys:
-            same = _path(key) == _path(trajectory_key)
+            same = key_path(key) == key_path(trajectory_key)
             leaf, target = (
                 source.get(key),
                 mixed.get(source_trajectory_key if same else key),
@@ -254,63 +248,61 @@ def _fill(
             )
 
 
-def _runs(source: TensorDictBase, trajectory_key: NestedKey, number: int) -> _Runs:
-    ids = source.get(trajectory_key, None)
-    if not isinstance(ids, torch.Tensor):
-        found = sorted(map(str, source.keys(include_nested=True, leaves_only=True)))
-        raise KeyError(
-            f"source {number} has no tensor {trajectory_key!r} to tell trajectories "
-            f"apart; it has {found}: give trajectory_key="
-        )
-    if ids.numel() != len(source):
-        raise ValueError(
-            f"{trajectory_key!r} of source {number} has the shape {tuple(ids.shape)}, "
-            f"wanted {(len(source),)} or {(len(source), 1)}"
-        )
-    ids = ids.reshape(-1).cpu()
-    begins = torch.ones(len(ids), dtype=torch.bool)
-    begins[1:] = ids[1:] != ids[:-1]
-    starts = begins.nonzero().squeeze(1)
-    names, pieces = ids[starts].unique(return_counts=True)
+def _index(
+    source: TensorDictBase, trajectory_key: NestedKey, number: int
+) -> TrajectoryIndex:
+    ids = get_leaf(
+        source,
+        trajectory_key,
+        f"source {number} lacks the trajectory ids",
+        "pass trajectory_key=",
+    )
+    try:
+        index = trajectory_index(source, trajectory_key=trajectory_key, done_key=None)
+    except ValueError as error:
+        raise ValueError(f"source {number}: {error}") from error
+    names, pieces = ids.reshape(-1)[index.starts].unique(return_counts=True)
     if (pieces > 1).any():
         raise ValueError(
             f"the rows of trajectory {names[pieces > 1][0].item()} of source {number} "
-            "do not lie one after another: sort them, or give every piece an id of its "
-            f"own in {trajectory_key!r}"
+            f"are not consecutive: sort them, or give each part its own id in "
+            f"{trajectory_key!r}"
         )
-    ends = torch.cat([starts[1:], torch.tensor([len(ids)])])
-    return _Runs(starts, ends - starts)
+    return index
 
 
 def _check_sources(sources: Sequence[TensorDictBase], new: Sequence[NestedKey]) -> None:
     if isinstance(sources, TensorDictBase) or not len(sources):
-        raise ValueError("sources must be a sequence of at least one tensordict")
-    wanted = _structure(sources[0], 0)
+        raise ValueError(
+            f"sources must be a sequence of at least one tensordict, got "
+            f"{type(sources).__name__} of length {len(sources)}"
+        )
+    expected = _structure(sources[0], 0)
     for number, source in enumerate(sources):
         if source.batch_dims != 1 or not len(source):
             raise ValueError(
-                f"source {number} has the batch size {list(source.batch_size)}, wanted "
+                f"source {number} has batch size {list(source.batch_size)}, expected "
                 "[T] with at least one row"
             )
         found = _structure(source, number)
-        lacking = sorted(set(wanted) ^ set(found))
+        lacking = sorted(set(expected) ^ set(found))
         if lacking:
             raise ValueError(
-                f"only one of source 0 and source {number} has {lacking}: leave them "
-                "out with exclude(), or add them"
+                f"only one of source 0 and source {number} has {lacking}: remove them "
+                "with exclude(), or add them"
             )
-        differ = {key: (wanted[key], found[key]) for key in wanted}
+        differ = {key: (expected[key], found[key]) for key in expected}
         differ = {key: pair for key, pair in differ.items() if pair[0] != pair[1]}
         if differ:
             raise ValueError(
-                f"leaves of source 0 and source {number} differ in dtype or shape "
-                f"behind the batch dimension: {differ}"
+                f"leaves of source 0 and source {number} differ in dtype or in the "
+                f"shape after the batch dimension: {differ}"
             )
         for key in new:
             if source.get(key, None) is not None:
                 raise ValueError(
                     f"source {number} already has {key!r}, which the mixture would "
-                    "overwrite: rename it, or give source_key= and "
+                    "overwrite: rename it, or pass source_key= and "
                     "source_trajectory_key="
                 )
 
@@ -322,7 +314,7 @@ def _structure(
     for key, leaf in rows.items(True, True, is_leaf=is_leaf_nontensor):
         if not isinstance(leaf, torch.Tensor):
             raise ValueError(
-                f"{key!r} of source {number} is no tensor: leave it out with exclude()"
+                f"{key!r} of source {number} is not a tensor: remove it with exclude()"
             )
-        structure[_path(key)] = (leaf.dtype, tuple(leaf.shape[1:]))
+        structure[key_path(key)] = (leaf.dtype, tuple(leaf.shape[1:]))
     return structure

@@ -1,4 +1,4 @@
-"""A replay buffer over a finished dataset."""
+"""A replay buffer over an existing dataset."""
 
 from __future__ import annotations
 
@@ -17,22 +17,26 @@ def offline_buffer(
     sampler: Sampler | None = None,
     **kwargs: Any,
 ) -> TensorDictReplayBuffer:
-    """Makes a replay buffer over rows that are already there; nothing is copied.
+    """Creates a replay buffer over existing transitions, without copying them.
 
-    The buffer cannot be extended. Scores written by :func:`score_buffer` go into
-    ``data``: to its folder, when it is memory-mapped.
+    The buffer cannot be extended. Scores written by
+    :func:`~torchrl_caiac.influence.score_buffer` become leaves of ``data``, in its
+    folder if it is memory-mapped.
 
     Args:
-        data (TensorDictBase): the rows, ``[T]``, in memory, memory-mapped (from
-            :func:`load_transitions` or :func:`load_minari`), or on a GPU.
-        batch_size (int, optional): rows per sample.
-        sampler (Sampler, optional): the sampler. Defaults to uniform sampling.
-        kwargs: more arguments of ``TensorDictReplayBuffer``.
+        data (TensorDictBase): the transitions, ``[T]``, in memory, memory-mapped (see
+            :func:`~torchrl_caiac.data.load_transitions`) or on a GPU.
+        batch_size (int, optional): the number of rows in a sample. Defaults to
+            ``None``: passed to every call of ``sample``.
+        sampler (Sampler, optional): the sampler. Defaults to ``None``: uniform sampling
+            with replacement.
+        **kwargs (Any): further arguments of ``TensorDictReplayBuffer``.
 
     Returns:
         TensorDictReplayBuffer: the buffer.
 
     Raises:
+        TypeError: ``data`` is not a tensordict.
         ValueError: ``data`` has no rows or several batch dimensions.
 
     Examples:
@@ -44,13 +48,13 @@ def offline_buffer(
         torch.Size([4, 2])
     """
     if not isinstance(data, TensorDictBase):
-        raise TypeError(f"data is a tensordict of rows, got {type(data).__name__}")
+        raise TypeError(f"data must be a tensordict, got {type(data).__name__}")
     if data.batch_dims != 1 or not len(data):
         raise ValueError(
-            f"data has the batch size {list(data.batch_size)}, wanted [T] with at "
-            "least one row: flatten trajectories, and tell them apart by an id"
+            f"data has batch size {list(data.batch_size)}, expected [T] with at least "
+            "one row: flatten trajectories, and mark them with ids"
         )
-    # Where the rows are drawn: rows of a GPU from the host would have to be sent there.
+    # Sample on the device of the data, to avoid transfers.
     device = data.device or next(iter(data.values(True, True))).device
     arguments: dict[str, Any] = {
         "storage": TensorStorage(data, device=device),

@@ -24,11 +24,11 @@ from torchrl_caiac.data.collect import (
 )
 from torchrl_caiac.data.minari_files import (
     free_dataset_path,
-    index_tree,
     publish_dataset,
-    stack_trees,
     work_folder,
 )
+from torchrl_caiac.data.trees import index_tree, stack_trees
+from torchrl_caiac.envs._requirements import REQUIREMENTS
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -252,6 +252,7 @@ def _create(
             target,
             lambda: _make_env(policy.num_cubes, policy.steps),
             code="torchrl_caiac/envs/fetch_push/datasets.py",
+            requirements=REQUIREMENTS,
             progress=progress,
             description=f"{description}: {summary}",
             algorithm_name=algorithm_name,

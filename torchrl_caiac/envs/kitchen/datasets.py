@@ -29,13 +29,13 @@ from torchrl_caiac.data.collect import (
 from torchrl_caiac.data.load_minari import load_minari
 from torchrl_caiac.data.minari_files import (
     free_dataset_path,
-    index_tree,
     open_minari,
     publish_dataset,
-    stack_trees,
     work_folder,
-    write_rows,
 )
+from torchrl_caiac.data.trees import index_tree, stack_trees
+from torchrl_caiac.data.write_transitions import check_free, write_transitions
+from torchrl_caiac.envs._requirements import REQUIREMENTS
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -329,6 +329,7 @@ def _create(
         target,
         lambda: _make_env(factory.tasks),
         code="torchrl_caiac/envs/kitchen/datasets.py",
+        requirements=REQUIREMENTS,
         progress=progress,
         description=description,
         algorithm_name="torchrl_caiac scripted expert",
@@ -434,6 +435,7 @@ def create_kitchen_random(
         target,
         lambda: _make_env(_TASKS),
         code="torchrl_caiac/envs/kitchen/datasets.py",
+        requirements=REQUIREMENTS,
         progress=progress,
         description=(
             f"{steps} uniformly random actions from each of {total} states of "
@@ -488,7 +490,7 @@ def kitchen_transitions(
 
     from torchrl_caiac.envs.kitchen.env import KITCHEN_TASKS
 
-    _check_free(path, overwrite)
+    check_free(path, overwrite)
     if isinstance(dataset, str):
         dataset = open_minari(dataset, root, download=download)
     indices = dataset.episode_indices
@@ -523,7 +525,9 @@ def kitchen_transitions(
         for name in infos:
             key = "task" if name == "task" else ("sim", name)
             rows[key] = loaded["info", name].clone()
-    return rows if path is None else write_rows(rows, path)
+    if path is None:
+        return rows
+    return write_transitions(rows, path, overwrite=overwrite)
 
 
 def load_d4rl_kitchen(
@@ -572,7 +576,7 @@ def load_d4rl_kitchen(
     import torch
     from tensordict import TensorDict
 
-    _check_free(path, overwrite)
+    check_free(path, overwrite)
     arrays = _read_d4rl(Path(file))
     over = (arrays["terminals"] | arrays["timeouts"]).copy()
     over[-1:] = True
@@ -601,15 +605,9 @@ def load_d4rl_kitchen(
         },
         batch_size=[len(kept)],
     )
-    return rows if path is None else write_rows(rows, path)
-
-
-def _check_free(path: str | os.PathLike[str] | None, overwrite: bool) -> None:
-    if path is not None and Path(path).exists() and not overwrite:
-        raise FileExistsError(
-            f"{path} exists; pass overwrite=True to replace it, or open it with "
-            "load_transitions"
-        )
+    if path is None:
+        return rows
+    return write_transitions(rows, path, overwrite=overwrite)
 
 
 #: Shapes and kinds of a D4RL kitchen's arrays, without the rows.

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_caiac.data.load_transitions import load_transitions
+from torchrl_caiac.data.write_transitions import check_free, write_transitions
+
+
+def transitions(value, length=3):
+    return TensorDict(
+        {
+            "action": torch.full((length, 2), value),
+            "episode": torch.zeros(length, dtype=torch.int64),
+            "next": {"done": torch.ones(length, 1, dtype=torch.bool)},
+        },
+        [length],
+    )
+
+
+def test_writes_and_replaces_a_folder(tmp_path):
+    path = tmp_path / "deep" / "data"
+    for value in (1.0, 2.0):
+        data = write_transitions(transitions(value), path, overwrite=value > 1)
+        assert data.is_memmap()
+        assert (data == transitions(value)).all()
+    assert [entry.name for entry in path.parent.iterdir()] == ["data"]
+    assert len(write_transitions(transitions(3.0, 5), f"{tmp_path}/other")) == 5
+
+
+def test_replaces_nothing_without_permission(tmp_path):
+    write_transitions(transitions(1.0), tmp_path / "data")
+    with pytest.raises(FileExistsError, match=r"data exists.*overwrite=True"):
+        write_transitions(transitions(2.0), tmp_path / "data")
+    assert (load_transitions(tmp_path / "data") == transitions(1.0)).all()
+    check_free(None)
+    check_free(tmp_path / "other")

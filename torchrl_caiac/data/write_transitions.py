@@ -1,0 +1,76 @@
+"""Writes a folder of transitions, atomically."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_caiac._files import whole_folder
+from torchrl_caiac.data.load_transitions import load_transitions
+
+__all__ = ["check_free", "write_transitions"]
+
+
+def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> None:
+    """Raises if a folder of transitions would be replaced without permission.
+
+    Args:
+        path (path, optional): the folder to write. ``None``: nothing is written.
+        overwrite (bool): whether the folder may be replaced. Defaults to ``False``.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+
+    Examples:
+        >>> from torchrl_caiac.data.write_transitions import check_free
+        >>> check_free("/tmp", overwrite=True)
+    """
+    if path is not None and not overwrite and Path(path).exists():
+        raise FileExistsError(
+            f"{path} exists: open it with load_transitions, or pass overwrite=True to "
+            "replace it"
+        )
+
+
+def write_transitions(
+    data: TensorDictBase, path: str | os.PathLike[str], *, overwrite: bool = False
+) -> TensorDict:
+    """Writes transitions to a folder, atomically, and opens it.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        path (path): the folder.
+
+    Keyword Args:
+        overwrite (bool): whether to replace ``path`` if it exists. Defaults to
+            ``False``.
+
+    Returns:
+        TensorDict: the memory-mapped transitions, ``[T]``.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.write_transitions import write_transitions
+        >>> data = TensorDict(
+        ...     {
+        ...         "action": torch.zeros(3, 2),
+        ...         "episode": torch.zeros(3, dtype=torch.int64),
+        ...         "next": {"done": torch.tensor([[False], [False], [True]])},
+        ...     },
+        ...     [3],
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_transitions(data, f"{folder}/data").is_memmap()
+        True
+    """
+    check_free(path, overwrite)
+    with whole_folder(path) as folder:
+        data.memmap(folder)
+    return load_transitions(Path(path))

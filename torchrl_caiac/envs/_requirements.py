@@ -1,0 +1,8 @@
+"""The packages that the environments need, as their datasets state them."""
+
+from __future__ import annotations
+
+__all__ = ["REQUIREMENTS"]
+
+#: In the form of a requirements file.
+REQUIREMENTS = ("gymnasium-robotics>=1.4,<1.5", "mujoco>=3.1,<3.12")
