@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+# First: if mujoco cannot be imported, this import explains why.
+from torchrl_caiac.envs.rendering import RenderingUnavailable
+
+# isort: split
 from torchrl_caiac.envs.fetch_push import (
     FETCH_PUSH_ENV_ID,
     FetchPushCubes,
@@ -30,7 +34,6 @@ from torchrl_caiac.envs.kitchen import (
     load_d4rl_kitchen,
     make_kitchen_env,
 )
-from torchrl_caiac.envs.rendering import RenderingUnavailable
 
 __all__ = [
     "FETCH_PUSH_ENV_ID",

@@ -1,8 +1,7 @@
-"""Fetch-Push's datasets: what they hold can be played again, and becomes rows."""
+"""Fetch-Push datasets can be replayed and loaded as transitions."""
 
 from __future__ import annotations
 
-import pickle
 import re
 
 import minari
@@ -18,7 +17,6 @@ from torchrl_caiac.envs.fetch_push import (
     create_fetch_push_expert,
     create_fetch_push_random,
 )
-from torchrl_caiac.envs.fetch_push.datasets import _Factory
 
 STEPS = 45
 NOISE = 0.1
@@ -109,7 +107,7 @@ def test_episodes_can_be_played_again(name, request):
     assert len(first) == dataset.total_episodes
 
 
-def test_the_expert_acts_with_the_noise_asked_for(expert):
+def test_the_expert_acts_with_the_requested_noise(expert):
     noise = []
     policy = FetchPushExpert(2)
     for episode in expert.iterate_episodes():
@@ -119,7 +117,7 @@ def test_the_expert_acts_with_the_noise_asked_for(expert):
         )
     noise = np.concatenate(noise)
     assert abs(noise.mean()) < 0.02
-    # A little less, as noise beyond the action's limits is cut off.
+    # A little less, since actions are clipped.
     assert 0.8 * NOISE < noise.std() < 1.05 * NOISE
 
 
@@ -130,7 +128,7 @@ def test_random_actions_are_uniform(random_actions):
     assert np.abs(actions.std(0) - 1 / np.sqrt(3)).max() < 0.06
 
 
-def test_success_is_told(expert, random_actions):
+def test_success_is_in_the_description(expert, random_actions):
     for dataset in (expert, random_actions):
         success = [e.infos["success"] for e in dataset.iterate_episodes()]
         shares = np.mean([s.any() for s in success]), np.mean([s[-1] for s in success])
@@ -180,7 +178,7 @@ def test_rows_and_their_mixture(expert, random_actions, tmp_path):
     assert (mixed["source"].bincount() / STEPS).tolist() == [3, 7]
 
 
-def test_a_dataset_is_not_replaced_unasked(expert, root, work):
+def test_a_dataset_is_replaced_only_with_overwrite(expert, root, work):
     with pytest.raises(FileExistsError, match="overwrite=True"):
         create_fetch_push_expert(root=root)
     arguments = {
@@ -195,7 +193,7 @@ def test_a_dataset_is_not_replaced_unasked(expert, root, work):
     }
     with pytest.raises(ValueError, match="holds another collection"):
         create_fetch_push_expert(steps=STEPS + 1, **arguments)
-    # What is missing is made anew, and the same.
+    # A missing file is collected again, and is the same.
     (work / "fetch-push-2-expert-v0" / "episode_000001.npz").unlink()
     again = create_fetch_push_expert(steps=STEPS, **arguments)
     for left, right in zip(
@@ -227,19 +225,21 @@ def test_another_number_of_cubes_without_states(tmp_path):
             load_minari(dataset, tmp_path / "rows", infos=["simulator"], progress=False)
 
 
-def test_other_processes_can_make_episodes():
-    spec = {
-        "name": "random",
-        "num_cubes": 1,
-        "steps": 3,
-        "action_noise": 0.0,
-        "episodes": 2,
-        "simulator_states": False,
-    }
-    made = [pickle.loads(pickle.dumps(_Factory(1, 3)))()(spec, 5) for _ in range(2)]
-    np.testing.assert_array_equal(made[0]["actions"], made[1]["actions"])
-    assert made[0]["actions"].shape == (2, 3, 4)
-    assert not np.array_equal(made[0]["actions"][0], made[0]["actions"][1])
+@pytest.mark.slow
+def test_two_workers_collect_the_same(random_actions, tmp_path):
+    dataset = create_fetch_push_random(
+        episodes=7,
+        steps=STEPS,
+        episodes_per_file=4,
+        root=tmp_path,
+        workers=2,
+        progress=False,
+    )
+    for left, right in zip(
+        dataset.iterate_episodes(), random_actions.iterate_episodes(), strict=True
+    ):
+        np.testing.assert_array_equal(left.actions, right.actions)
+        np.testing.assert_array_equal(left.infos["simulator"], right.infos["simulator"])
 
 
 @pytest.mark.parametrize(
@@ -247,7 +247,7 @@ def test_other_processes_can_make_episodes():
 )
 @pytest.mark.parametrize("create", [create_fetch_push_expert, create_fetch_push_random])
 def test_numbers_out_of_range(create, name, tmp_path):
-    with pytest.raises(ValueError, match=f"{name} is 0, wanted at least 1"):
+    with pytest.raises(ValueError, match=f"{name} is 0, expected at least 1"):
         create(root=tmp_path, **{name: 0})
     assert not list(tmp_path.iterdir())
 

@@ -85,7 +85,7 @@ class TestSuccess:
         assert np.abs(moved[:3]).max() < 1e-3
         assert np.abs(moved[3:]).max() > 0.05
 
-    def test_waits_above_when_all_is_done(self, env):
+    def test_waits_above_after_success(self, env):
         places = [[1.4, 0.7], [1.3, 0.85]]
         observations, actions, infos = play(
             env,
@@ -141,7 +141,7 @@ class TestChoice:
 
 
 class TestFunctionOfTheObservation:
-    def test_remembers_nothing(self, env):
+    def test_has_no_memory(self, env):
         observations, actions, _ = play(env, FetchPushExpert(2), seed=5, steps=60)
         expert = FetchPushExpert(2)
         for i in np.random.default_rng(0).permutation(60):
@@ -229,8 +229,8 @@ def test_bad_observations(env):
         FetchPushExpert(2)({**observation, "desired_goal": np.zeros(3)})
 
 
-def test_main_says_the_success(caplog):
-    with caplog.at_level(logging.INFO, logger=expert.logger.name):
+def test_main_logs_the_success(caplog):
+    with caplog.at_level(logging.INFO, logger=expert.__name__):
         assert expert.main(["--cubes", "1", "--episodes", "2"]) == 0
     text = caplog.text
     assert "50 steps" in text and "100 steps" in text

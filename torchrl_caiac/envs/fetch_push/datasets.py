@@ -1,27 +1,24 @@
-"""Fetch-Push's Minari datasets: episodes of the scripted expert and random ones.
+"""Minari datasets of Fetch-Push: episodes of the scripted expert and random ones.
 
-Both have the schema of a goal environment, `FetchPushCubes`' own observations; with
-:func:`~torchrl_caiac.data.load_minari.load_minari` they become TorchRL rows, with
-:func:`~torchrl_caiac.data.mix_trajectories.mix_trajectories` a mixture of the two.
+Both have the observations of :class:`~torchrl_caiac.envs.FetchPushCubes`.
+:func:`~torchrl_caiac.data.load_minari` turns them into TorchRL transitions, and
+:func:`~torchrl_caiac.data.mix_trajectories` mixes the two.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 
-from torchrl_caiac.data.collect import (
-    EpisodeSource,
-    collect_episodes,
-    load_episode,
-    record_episode,
-)
+from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
 from torchrl_caiac.data.minari_files import (
     free_dataset_path,
     publish_dataset,
@@ -29,14 +26,19 @@ from torchrl_caiac.data.minari_files import (
 )
 from torchrl_caiac.data.trees import index_tree, stack_trees
 from torchrl_caiac.envs._requirements import REQUIREMENTS
+from torchrl_caiac.envs.fetch_push.env import FetchPushCubes
+from torchrl_caiac.envs.fetch_push.expert import FetchPushExpert
+from torchrl_caiac.envs.fetch_push.registration import FETCH_PUSH_ENV_ID
+from torchrl_caiac.envs.fetch_push.task import fetch_push_distances
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
+    from numpy.typing import NDArray
 
 __all__ = ["create_fetch_push_expert", "create_fetch_push_random"]
 
-logger = logging.getLogger("torchrl_caiac.envs.fetch_push.datasets")
+_logger = logging.getLogger("torchrl_caiac.envs.fetch_push.datasets")
 
 _POLICIES = _EXPERT, _RANDOM = ("expert", "random")
 
@@ -57,56 +59,63 @@ def create_fetch_push_expert(
     overwrite: bool = False,
     progress: bool = True,
 ) -> MinariDataset:
-    """Collect episodes of the scripted expert as a Minari dataset.
+    """Collects episodes of the scripted expert as a Minari dataset.
 
-    Every episode has `steps` steps and is kept, successful or not: the paper's expert
-    fails now and then too (A.6.2). Logged, and in the dataset's description, are the
-    shares of episodes in which all cubes are at their goals at some time, which the
-    paper calls success, and at the end. Infos hold, with `L = steps`, "success" bool
-    `[L + 1]` and "simulator" float64 `[L + 1, S]`, the simulator's exact state
-    (`FetchPushCubes.set_simulator_state` restores it).
+    Every episode has ``steps`` steps and is kept, successful or not: the expert of the
+    paper fails at times too (A.6.2). The log and the description of the dataset name
+    two shares of episodes: those in which all cubes are at their goals at some step,
+    which the paper calls success, and those in which they are at the end. With
+    ``L = steps``, the infos contain ``"success"``, bool ``[L + 1]``, and
+    ``"simulator"``, float64 ``[L + 1, S]``, the exact simulator state, which
+    ``FetchPushCubes.set_simulator_state`` restores.
 
     Args:
-        dataset_id: Minari's name of the dataset; `fetch-push-2/expert-v0`, or with the
-            number of cubes in its place, where None.
+        dataset_id (str, optional): the name of the dataset in Minari. Defaults to
+            ``fetch-push-{num_cubes}/expert-v0``.
 
     Keyword Args:
-        episodes: how many.
-        num_cubes: cubes on the table.
-        steps: steps of an episode.
-        action_noise: of the expert, standard deviation; actions are in [-1, 1].
-        simulator_states: keep "simulator" in the infos.
-        root: folder of Minari datasets; `MINARI_DATASETS_PATH` or Minari's own where
-            None.
-        work: folder that keeps what is finished, so that a collection that was cut off
-            goes on; a temporary one where None.
-        episodes_per_file: episodes that a process makes at a time.
-        seed: seed of the collection.
-        workers: processes; one per processor where None.
-        overwrite: replace a dataset of that name.
-        progress: show progress bars.
+        episodes (int): the number of episodes. Defaults to 600.
+        num_cubes (int): the number of cubes. Defaults to 2.
+        steps (int): the number of steps of an episode. Defaults to 100.
+        action_noise (float): the standard deviation of the noise on the expert's
+            actions, which are in [-1, 1]. Defaults to 0.2.
+        simulator_states (bool): if ``True``, the infos contain ``"simulator"``.
+            Defaults to ``True``.
+        root (path, optional): the folder of Minari datasets. Defaults to
+            ``MINARI_DATASETS_PATH`` or Minari's own.
+        work (path, optional): a folder for finished episodes, from which an interrupted
+            collection resumes. Defaults to a temporary folder.
+        episodes_per_file (int): the number of episodes that a process collects at a
+            time. Defaults to 10.
+        seed (int): the seed of the collection. Defaults to 0.
+        workers (int, optional): the number of processes. Defaults to one per processor.
+        overwrite (bool): if ``True``, replaces a dataset of that name. Defaults to
+            ``False``.
+        progress (bool): if ``True``, shows progress bars. Defaults to ``True``.
 
     Returns:
-        the dataset.
+        MinariDataset: the dataset.
 
     Raises:
-        FileExistsError: there is a dataset of that name and `overwrite` is False.
-        ValueError: a number is out of range.
+        FileExistsError: there is a dataset of that name and ``overwrite`` is ``False``.
+        ValueError: a number is out of range, or ``work`` has another collection.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> from torchrl_caiac.data import load_minari
         >>> from torchrl_caiac.envs import create_fetch_push_expert
         >>> with tempfile.TemporaryDirectory() as root:
         ...     dataset = create_fetch_push_expert(
-        ...         episodes=2, steps=5, root=root, workers=1, progress=False)
+        ...         episodes=2, steps=5, root=root, workers=1, progress=False
+        ...     )
         ...     rows = load_minari(
-        ...         dataset, f"{root}/rows", infos=["simulator"], progress=False)
+        ...         dataset, f"{root}/rows", infos=["simulator"], progress=False
+        ...     )
         >>> dataset.id, rows.batch_size, rows["next", "achieved_goal"].shape
         ('fetch-push-2/expert-v0', torch.Size([10]), torch.Size([10, 6]))
     """
     if not (np.isfinite(action_noise) and action_noise >= 0):
-        raise ValueError(f"action_noise is {action_noise}, wanted at least 0")
+        raise ValueError(f"action_noise is {action_noise}, expected at least 0")
     return _create(
         dataset_id or f"fetch-push-{num_cubes}/expert-v0",
         _Policy(_EXPERT, num_cubes, steps, action_noise),
@@ -139,35 +148,48 @@ def create_fetch_push_random(
     overwrite: bool = False,
     progress: bool = True,
 ) -> MinariDataset:
-    """Collect episodes of uniformly random actions as a Minari dataset.
+    """Collects episodes of uniformly random actions as a Minari dataset.
 
-    The same schema as :func:`create_fetch_push_expert`.
+    The dataset has the schema of :func:`create_fetch_push_expert`.
 
     Args:
-        dataset_id: Minari's name of the dataset; `fetch-push-2/random-v0`, or with the
-            number of cubes in its place, where None.
+        dataset_id (str, optional): the name of the dataset in Minari. Defaults to
+            ``fetch-push-{num_cubes}/random-v0``.
 
     Keyword Args:
-        episodes: how many.
-        num_cubes: cubes on the table.
-        steps: steps of an episode.
-        simulator_states: keep "simulator" in the infos.
-        root: folder of Minari datasets; `MINARI_DATASETS_PATH` or Minari's own where
-            None.
-        work: folder that keeps what is finished, so that a collection that was cut off
-            goes on; a temporary one where None.
-        episodes_per_file: episodes that a process makes at a time.
-        seed: seed of the collection.
-        workers: processes; one per processor where None.
-        overwrite: replace a dataset of that name.
-        progress: show progress bars.
+        episodes (int): the number of episodes. Defaults to 1400.
+        num_cubes (int): the number of cubes. Defaults to 2.
+        steps (int): the number of steps of an episode. Defaults to 100.
+        simulator_states (bool): if ``True``, the infos contain ``"simulator"``.
+            Defaults to ``True``.
+        root (path, optional): the folder of Minari datasets. Defaults to
+            ``MINARI_DATASETS_PATH`` or Minari's own.
+        work (path, optional): a folder for finished episodes, from which an interrupted
+            collection resumes. Defaults to a temporary folder.
+        episodes_per_file (int): the number of episodes that a process collects at a
+            time. Defaults to 10.
+        seed (int): the seed of the collection. Defaults to 0.
+        workers (int, optional): the number of processes. Defaults to one per processor.
+        overwrite (bool): if ``True``, replaces a dataset of that name. Defaults to
+            ``False``.
+        progress (bool): if ``True``, shows progress bars. Defaults to ``True``.
 
     Returns:
-        the dataset.
+        MinariDataset: the dataset.
 
     Raises:
-        FileExistsError: there is a dataset of that name and `overwrite` is False.
-        ValueError: a number is out of range.
+        FileExistsError: there is a dataset of that name and ``overwrite`` is ``False``.
+        ValueError: a number is out of range, or ``work`` has another collection.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac.envs import create_fetch_push_random
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     dataset = create_fetch_push_random(
+        ...         episodes=2, steps=5, root=root, workers=1, progress=False
+        ...     )
+        >>> dataset.id, dataset.total_steps
+        ('fetch-push-2/random-v0', 10)
     """
     return _create(
         dataset_id or f"fetch-push-{num_cubes}/random-v0",
@@ -219,7 +241,7 @@ def _create(
         "episodes_per_file": episodes_per_file,
     }.items():
         if value < 1:
-            raise ValueError(f"{name} is {value}, wanted at least 1")
+            raise ValueError(f"{name} is {value}, expected at least 1")
     target = free_dataset_path(dataset_id, root, overwrite)
     specs = [
         {
@@ -231,7 +253,7 @@ def _create(
     ]
     with work_folder(work, dataset_id) as folder:
         report = collect_episodes(
-            _Factory(policy.num_cubes, policy.steps),
+            functools.partial(_Source, policy.num_cubes, policy.steps),
             specs,
             folder,
             seed=seed,
@@ -245,7 +267,7 @@ def _create(
             f"cubes; every cube is at its goal in {reached:.1%} of them at some time, "
             f"in {ended:.1%} at the end"
         )
-        logger.info("%s: %s", dataset_id, summary)
+        _logger.info("%s: %s", dataset_id, summary)
         return publish_dataset(
             dataset_id,
             (buffer for file in report.files for buffer in _buffers(file)),
@@ -259,64 +281,35 @@ def _create(
         )
 
 
-# Sources of episodes. They live in worker processes, made there by the factory.
-
-
-@dataclasses.dataclass(frozen=True)
-class _Factory:
-    num_cubes: int
-    steps: int
-
-    def __call__(self) -> EpisodeSource:
-        return _Source(_make_env(self.num_cubes, self.steps))
-
-
-def _make_env(num_cubes: int, steps: int) -> Any:
-    import gymnasium
-
-    from torchrl_caiac.envs.fetch_push.env import FETCH_PUSH_ENV_ID, FetchPushCubes
-
+def _make_env(num_cubes: int, steps: int) -> FetchPushCubes:
     arguments: dict[str, Any] = {"num_cubes": num_cubes, "max_episode_steps": steps}
     env = FetchPushCubes(**arguments)
-    # gymnasium.make keeps max_episode_steps to itself, but not what a specification
-    # holds: from this one Minari makes the same environment again.
+    # Minari recreates the environment from its specification. ``gymnasium.make`` would
+    # leave max_episode_steps out of it.
     env.spec = dataclasses.replace(gymnasium.spec(FETCH_PUSH_ENV_ID), kwargs=arguments)
     return env
 
 
 class _Source:
-    """Makes some episodes at a time, stacked `[M, *]`."""
+    """Collects several episodes at a time, stacked ``[M, *]``."""
 
-    def __init__(self, env: Any) -> None:
-        self.env = env
+    def __init__(self, num_cubes: int, steps: int) -> None:
+        self.env = _make_env(num_cubes, steps)
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any]:
-        # The two datasets must not share starts and goals, whatever seeds they have.
+        # The two datasets must not share starts and goals, whatever their seeds are.
         words = np.random.SeedSequence([seed, _POLICIES.index(spec["name"])])
         seeds = words.generate_state(spec["episodes"]) >> 1
         episodes = [self._episode(spec, int(one)) for one in seeds]
         return {"seeds": seeds, **stack_trees(episodes)}
 
     def _episode(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any]:
-        from torchrl_caiac.envs.fetch_push.env import fetch_push_distances
-
         observation, _ = self.env.reset(seed=seed)
-        # Not the stream that starts and goals are drawn from.
-        rng = np.random.default_rng([seed, 1])
-        if spec["name"] == _EXPERT:
-            from torchrl_caiac.envs.fetch_push.expert import FetchPushExpert
-
-            act: Callable[[Any], Any] = FetchPushExpert(
-                spec["num_cubes"], action_noise=spec["action_noise"], rng=rng
-            )
-        else:
-
-            def act(_: Any) -> Any:
-                return rng.uniform(-1.0, 1.0, 4)
-
+        # Not the stream from which starts and goals are drawn.
+        act = _policy(spec, np.random.default_rng([seed, 1]))
         episode = record_episode(
             self.env,
-            # What is stored is what was done: the action space is float32.
+            # The action space is float32: the stored action is the executed one.
             lambda observation: np.asarray(act(observation), np.float32),
             observation,
             max_steps=spec["steps"],
@@ -336,11 +329,18 @@ class _Source:
         self.env.close()
 
 
-# Minari.
+def _policy(
+    spec: Mapping[str, Any], rng: np.random.Generator
+) -> Callable[[Any], NDArray[Any]]:
+    if spec["name"] == _RANDOM:
+        return lambda observation: rng.uniform(-1.0, 1.0, 4)
+    return FetchPushExpert(
+        spec["num_cubes"], action_noise=spec["action_noise"], rng=rng
+    )
 
 
 def _success_shares(files: Sequence[Path]) -> tuple[float, float]:
-    """Return the shares of episodes with success at some time, and at the end."""
+    """Returns the shares of episodes with success at some step, and at the end."""
     success = np.concatenate(
         [load_episode(file)[0]["infos"]["success"] for file in files]
     )

@@ -1,11 +1,11 @@
-"""A scripted expert for Fetch-Push that remembers nothing.
+"""A scripted expert for Fetch-Push without memory.
 
-Its action is a function of the observation and the goal, so that a policy that sees the
-same can learn it: from demonstrations with hidden phases ("now going around the cube")
-nothing can be learnt that acts on observations.
+Its action is a function of the observation and the goal, so a policy with the same
+inputs can learn it. Demonstrations with hidden phases ("now going around the cube")
+could not be learnt from observations.
 
 ``python -m torchrl_caiac.envs.fetch_push.expert --episodes 200 --action-noise 0.2``
-measures it.
+measures its success.
 """
 
 from __future__ import annotations
@@ -22,31 +22,33 @@ if TYPE_CHECKING:
 
 __all__ = ["FetchPushExpert"]
 
-logger = logging.getLogger("torchrl_caiac.envs.fetch_push.expert")
+_logger = logging.getLogger("torchrl_caiac.envs.fetch_push.expert")
 
-# Heights of the gripper, metres: the fingers' tips next to a cube, and above all cubes.
+# Heights of the gripper in metres: with the tips of the fingers next to a cube, and
+# above all cubes.
 _PUSH_HEIGHT, _SAFE_HEIGHT = 0.425, 0.50
 _LOW = 0.445
-# What an action of 1 moves the gripper by in one step, metres; one step, seconds.
+# How far an action of 1 moves the gripper in one step, in metres; the duration of a
+# step, in seconds.
 _REACH = 0.033
 _STEP_SECONDS = 0.04
-# The gripper descends this far behind the cube's centre. (Half a cube and half of the
-# closed fingers are 4 cm.)
+# The gripper descends this far behind the centre of the cube. (Half a cube and half of
+# the closed fingers are 4 cm.)
 _BEHIND = 0.065
-# It pushes while it is low, this far behind the centre and this near to the line from
+# It pushes while it is low, this far behind the centre, and this close to the line from
 # the cube to its goal.
 _PUSH_BEHIND = (0.025, 0.075)
 _PUSH_ASIDE = 0.02
-# A cube that is being pushed is brought this near to its goal; one that is not is left
-# alone until it is this far: a threshold with hysteresis, whose memory is the place of
+# The expert stops pushing a cube that is this close to its goal, and starts with a cube
+# that is this far from it: a threshold with hysteresis, whose memory is the position of
 # the gripper.
 _DONE_PUSHED, _DONE_LEFT = 0.015, 0.04
-# A way or goal with a cube nearer than this is blocked; the gripper flies over cubes
-# that are nearer than this to its way.
+# A cube blocks a path or a goal that is closer than this; the gripper moves over cubes
+# that are closer than this to its path.
 _BLOCKED, _CLEARANCE = 0.06, 0.055
-# A cube let go at speed v (metres per second) slides on for v^2 / (2 * 9.81), its
-# friction being 1. The pusher slows down with it: this share of the speed from which
-# the cube would slide to its goal.
+# A cube that is released at speed v (metres per second) slides v^2 / (2 * 9.81), since
+# its friction is 1. The gripper pushes at this share of the speed from which the cube
+# would slide to its goal.
 _DECELERATION = 9.81
 _SPEED_SHARE = 0.6
 _SIDEWAYS_GAIN = 20.0
@@ -55,31 +57,33 @@ _SIDEWAYS_GAIN = 20.0
 class FetchPushExpert:
     """Pushes one cube after the other to its goal (the expert data of A.6.2).
 
-    It chooses a cube that is not at its goal: the one it is pushing, else one whose way
-    is free and which does not end up in the way of another, else the nearest to its
-    goal. It flies behind that cube (opposite to the goal), descends, pushes along the
-    line to the goal with lateral correction, and flies there again when it has lost the
-    line. Since cubes slide on, it brakes before the goal. When all cubes are done it
-    goes up and waits. Cubes that stand in each other's way may be pushed back and forth
-    for long: with two cubes this is rare, with three it costs some episodes.
+    It chooses a cube that is not at its goal: the one that it is pushing, else one with
+    a free path that does not block another cube, else the one that is closest to its
+    goal. It moves behind that cube (opposite to the goal), descends, and pushes along
+    the line to the goal with lateral correction. If it loses the line, it moves behind
+    the cube again. Since cubes slide, it brakes before the goal. When all cubes are at
+    their goals, it moves up and waits. Cubes that block each other may be pushed back
+    and forth for long: this is rare with two cubes and costs some episodes with three.
 
-    Why episodes have 100 steps: the median episode with two cubes is done after 30
-    steps, after 37 with the noise of the data (0.2). But of 200 episodes with noise 36
-    are not done after 50 steps, and 1 after 100: pushes that went astray are begun
-    anew. In episodes of 50 steps the expert would show mostly the starts that are easy.
+    Why episodes have 100 steps: the median episode with two cubes takes 30 steps, and
+    37 with the noise of the data (0.2). But of 200 episodes with noise, 36 take more
+    than 50 steps and 1 takes more than 100, because failed pushes are repeated.
+    Episodes of 50 steps would mostly show easy starts.
 
     Args:
-        num_cubes: ``n``.
+        num_cubes (int): the number of cubes ``n``. Defaults to 2.
 
     Keyword Args:
-        action_noise: standard deviation of the noise on every action.
-        rng: source of the noise; a ``numpy.random.Generator`` or a seed.
+        action_noise (float): the standard deviation of the noise on every action.
+            Defaults to 0.
+        rng (np.random.Generator or int, optional): the source of the noise, or its
+            seed.
 
     Raises:
         ValueError: ``num_cubes`` or ``action_noise`` is out of range.
 
-    Example:
-        >>> from torchrl_caiac.envs.fetch_push.env import FetchPushCubes
+    Examples:
+        >>> from torchrl_caiac.envs import FetchPushCubes, FetchPushExpert
         >>> env, expert = FetchPushCubes(2), FetchPushExpert(2)
         >>> observation, info = env.reset(seed=0)
         >>> for _ in range(100):
@@ -96,10 +100,10 @@ class FetchPushExpert:
         rng: np.random.Generator | int | None = None,
     ) -> None:
         if num_cubes < 1:
-            raise ValueError(f"num_cubes is {num_cubes}, wanted at least 1")
+            raise ValueError(f"num_cubes is {num_cubes}, expected at least 1")
         if not (np.isfinite(action_noise) and action_noise >= 0):
             raise ValueError(
-                f"action_noise is {action_noise}, wanted a standard deviation of at "
+                f"action_noise is {action_noise}, expected a standard deviation of at "
                 "least 0"
             )
         self.num_cubes = num_cubes
@@ -107,28 +111,32 @@ class FetchPushExpert:
         self.rng = np.random.default_rng(rng)
 
     def __call__(self, observation: Mapping[str, Any]) -> NDArray[np.float32]:
-        """Return the action with noise, clipped.
+        """Returns the action with noise.
 
         Args:
-            observation: see :meth:`act`.
+            observation (mapping): see :meth:`act`.
 
         Returns:
-            ``[*B, 4]`` in [-1, 1], float32.
+            NDArray: ``[*B, 4]``, float32, clipped to [-1, 1].
         """
         action = self.act(observation)
         noise = self.action_noise * self.rng.normal(size=action.shape)
         return np.clip(action + noise, -1.0, 1.0).astype(np.float32)
 
     def act(self, observation: Mapping[str, Any]) -> NDArray[np.float64]:
-        """Return the action without noise.
+        """Returns the action without noise.
 
         Args:
-            observation: of :class:`~torchrl_caiac.envs.FetchPushCubes`, or
-                a batch: ``"observation"`` ``[*B, 10 + 12 n]`` and ``"desired_goal"``
+            observation (mapping): of :class:`~torchrl_caiac.envs.FetchPushCubes`, or a
+                batch: ``"observation"`` ``[*B, 10 + 12 n]`` and ``"desired_goal"``
                 ``[*B, 3 n]``.
 
         Returns:
-            ``[*B, 4]`` in [-1, 1]; the fourth number, which does nothing, is 0.
+            NDArray: ``[*B, 4]`` in [-1, 1]; the fourth number, which has no effect, is
+            0.
+
+        Raises:
+            ValueError: the shapes are not those of ``n`` cubes.
         """
         n = self.num_cubes
         state = np.asarray(observation["observation"], dtype=np.float64)
@@ -139,7 +147,7 @@ class FetchPushExpert:
         ):
             if not value.shape or value.shape[-1] != width:
                 raise ValueError(
-                    f"{name!r} has shape {value.shape}, wanted [*B, {width}] for "
+                    f"{name!r} has shape {value.shape}, expected [*B, {width}] for "
                     f"{n} cubes"
                 )
         batch = state.shape[:-1]
@@ -156,7 +164,7 @@ class FetchPushExpert:
         way = goals[..., :2] - cubes
         distance = _norm(way)
         ahead = way / np.maximum(distance, 1e-6)[..., None]
-        # Where the gripper is, seen from each cube [R, n].
+        # The position of the gripper relative to each cube [R, n].
         offset = gripper[:, None] - cubes
         behind = -(offset * ahead).sum(-1)
         aside = offset + behind[..., None] * ahead
@@ -173,7 +181,7 @@ class FetchPushExpert:
         # Metres, and one for each obstacle.
         cost = distance - 2.0 * pushing
         target = goals[..., :2]
-        # [R, i, j]: does cube j stand in the way of cube i; does i's goal, of cube j?
+        # [R, i, j]: does cube j block the path of cube i; does the goal of i block j?
         stands = _blocks(cubes[:, None, :], cubes[:, :, None], target[:, :, None])
         would = _blocks(target[:, :, None], cubes[:, None, :], target[:, None, :])
         others = ~np.eye(self.num_cubes, dtype=np.bool_)
@@ -191,7 +199,7 @@ class FetchPushExpert:
         push = _action(
             speed[:, None] * ahead - _SIDEWAYS_GAIN * aside, _PUSH_HEIGHT - height
         )
-        # Going behind the cube: over other cubes, where one is near the way.
+        # Moving behind the cube, and over other cubes that are close to the path.
         to = cubes[rows, chosen] - _BEHIND * ahead - gripper
         left = _norm(to)
         near = _segment(cubes, gripper[:, None], (gripper + to)[:, None]).min(-1)
@@ -202,7 +210,7 @@ class FetchPushExpert:
         risen = np.where(over, np.clip((height + 0.035 - level) / 0.03, 0, 1), 1.0)
         share = np.minimum(1.0, left / _REACH) * risen / np.maximum(left, 1e-6)
         go = _action(share[:, None] * to, level - height)
-        # Nothing left to do: up.
+        # All cubes are at their goals: up.
         wait = _action(np.zeros_like(gripper), _SAFE_HEIGHT - height)
 
         busy = todo.any(-1, keepdims=True)
@@ -216,7 +224,7 @@ def _norm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 def _action(
     sideways: NDArray[np.float64], rise: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Join shares of the speed ``[R, 2]`` and a change of height ``[R]``."""
+    """Joins shares of the speed ``[R, 2]`` and a change of height ``[R]``."""
     sideways = sideways / np.maximum(_norm(sideways), 1.0)[:, None]
     rise = np.clip(rise / _REACH, -1.0, 1.0)
     return np.stack((*sideways.T, rise, np.zeros_like(rise)), axis=-1)
@@ -225,7 +233,7 @@ def _action(
 def _segment(
     point: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the distance of points from the segments between starts and ends."""
+    """Returns the distance of points from the segments between starts and ends."""
     line = end - start
     share = ((point - start) * line).sum(-1) / np.maximum(np.square(line).sum(-1), 1e-9)
     return _norm(point - start - np.clip(share, 0.0, 1.0)[..., None] * line)
@@ -238,8 +246,15 @@ def _blocks(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the expert's success and say it on standard output."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
+    """Measures the success of the expert and logs it.
+
+    Args:
+        arguments (sequence of str, optional): the command line.
+
+    Returns:
+        int: 0 if an episode succeeded, else 1.
+    """
+    parser = argparse.ArgumentParser(description="Measures the success of the expert.")
     parser.add_argument("--cubes", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--action-noise", type=float, default=0.2)
@@ -262,7 +277,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             observation, *_, info = env.step(expert(observation))
             row[step] = info["success"]
     for length in (50, steps):
-        logger.info(
+        _logger.info(
             "%d cubes, action noise %g, %d steps: all at their goals at some step in "
             "%.3f and at the last step in %.3f of %d episodes",
             options.cubes,
@@ -274,7 +289,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     reached = success.any(-1)
     if reached.any():
-        logger.info(
+        _logger.info(
             "first success after %d steps (median)",
             np.median(success[reached].argmax(-1)) + 1,
         )
