@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+import traceback
 from functools import partial
 
 import pytest
@@ -68,6 +69,17 @@ def uses(tool, number):
 
 def dies():
     os._exit(7)
+
+
+class TwoArguments(Exception):
+    """Cannot be unpickled: pickle calls it with one argument."""
+
+    def __init__(self, what, why):
+        super().__init__(f"{what}: {why}")
+
+
+def fails(kind, *args):
+    raise kind(*args)
 
 
 class Endless:
@@ -140,8 +152,10 @@ class TestRunInProcesses:
             jobs.divides, [(tmp_path, *pair) for pair in pairs], processes=1
         )
         assert next(runs) == (0, 2.0)
-        with pytest.raises(ZeroDivisionError):
+        with pytest.raises(ZeroDivisionError) as caught:
             next(runs)
+        # With the traceback of the process.
+        assert "in divides" in "".join(traceback.format_exception(caught.value))
         begun = {path.name for path in tmp_path.glob("* by *")}
         assert begun == {"4 by 2", "1 by 0"}
 
@@ -165,11 +179,24 @@ class TestRunInProcesses:
         }
         assert (os.getpid() in pids) == (processes == 0)
 
+    def test_without_jobs_nothing_is_set_up(self, jobs):
+        setup = partial(jobs.fails, ValueError)
+        assert list(run_in_processes(jobs.uses, [], processes=0, setup=setup)) == []
+
+    def test_errors_that_cannot_be_pickled_are_described(self, jobs):
+        runs = run_in_processes(
+            jobs.fails, [(jobs.TwoArguments, "sand", "wet")], processes=1
+        )
+        with pytest.raises(RuntimeError, match="TwoArguments: sand: wet") as caught:
+            next(runs)
+        assert "in fails" in "".join(traceback.format_exception(caught.value))
+
     @pytest.mark.parametrize("processes", [0, 1])
     def test_errors_of_set_up_are_raised(self, jobs, tmp_path, processes):
         setup = partial(jobs.Tool, tmp_path, works=False)
-        with pytest.raises(FileNotFoundError, match="no tool"):
+        with pytest.raises(FileNotFoundError, match="no tool") as caught:
             list(run_in_processes(jobs.uses, [(0,)], processes=processes, setup=setup))
+        assert "in __init__" in "".join(traceback.format_exception(caught.value))
 
     def test_a_process_that_dies_is_noticed(self, jobs):
         with pytest.raises(RuntimeError, match="ended in the middle of a job"):

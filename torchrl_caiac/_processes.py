@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -68,8 +69,9 @@ def run_in_processes(
 
     Jobs start in order; the next one starts when one has finished. If a job raises,
     jobs that have not started are dropped, and the error is raised when the running
-    ones have ended. The processes end with this one, however it ends. They are started
-    by ``spawn``, so a script needs the usual ``if __name__ == "__main__":``.
+    ones have ended, with the traceback of the process as its cause. The processes end
+    with this one, however it ends. They are started by ``spawn``, so a script needs the
+    usual ``if __name__ == "__main__":``.
 
     Args:
         function (callable): runs one job; picklable, as are its results.
@@ -80,6 +82,7 @@ def run_in_processes(
             one after another. Defaults to 2.
         setup (callable, optional): called once in each process. ``function`` gets its
             result as the first argument; it is closed at the end if it has ``close``.
+            Without jobs it is not called.
 
     Yields:
         tuple[int, Any]: the number of a finished job and its result, in the order in
@@ -88,7 +91,8 @@ def run_in_processes(
     Raises:
         ValueError: ``processes`` is negative.
         RuntimeError: a process ended in the middle of a job, for lack of memory for
-            example.
+            example; or an error that cannot be pickled, described with its traceback.
+        Exception: whatever a job or ``setup`` raised.
 
     Examples:
         >>> from math import hypot
@@ -140,9 +144,11 @@ def _run_here(
     jobs: Iterable[tuple[Any, ...]],
     setup: Callable[[], Any] | None,
 ) -> Iterator[tuple[int, Any]]:
-    made = () if setup is None else (setup(),)
+    made: tuple[Any, ...] = ()
     try:
         for number, job in enumerate(jobs):
+            if setup is not None and not made:
+                made = (setup(),)
             yield number, function(*made, *job)
     finally:
         for value in made:
@@ -166,9 +172,23 @@ def _one_thread_in_new_processes() -> Iterator[None]:
 def _run_job(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
     # Before every job: the one before may have raised it, as TorchRL's environments do.
     torch.set_num_threads(1)
-    if _setup_error is not None:
-        raise _setup_error
-    return function(*_worker, *job)
+    try:
+        if _setup_error is not None:
+            raise _setup_error
+        return function(*_worker, *job)
+    except Exception as error:
+        if _can_be_pickled(error):
+            raise
+        # The pool would break, and report the end of a process instead of the error.
+        raise RuntimeError(f"{type(error).__name__}: {error}") from error
+
+
+def _can_be_pickled(error: Exception) -> bool:
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return False
+    return True
 
 
 def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:

@@ -6,20 +6,17 @@ import dataclasses
 import hashlib
 import json
 import logging
-import multiprocessing
 import os
-import queue
-import tempfile
-import traceback
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, Union
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_caiac.experiments import end_with_parent
+from torchrl_caiac._files import whole_file, write_json
+from torchrl_caiac._processes import available_processors, run_in_processes
 
 __all__ = [
     "CollectionReport",
@@ -30,28 +27,26 @@ __all__ = [
     "record_episode",
 ]
 
-logger = logging.getLogger("torchrl_caiac.data.collect")
+_logger = logging.getLogger("torchrl_caiac.data.collect")
 
-#: Arrays by name, mappings nested.
+#: Arrays by name, in nested mappings.
 EpisodeArrays = Mapping[str, Union[NDArray[Any], "EpisodeArrays"]]
 _MANIFEST = "collection.json"
 _META = "meta"
 _SEPARATOR = "/"
-# A worker that was killed answers nothing: how often to look, seconds.
-_POLL_SECONDS = 1.0
 
 
 class EpisodeSource(Protocol):
-    """Makes one episode; lives in a worker process and may keep an environment.
+    """Makes episodes. It is created in a worker process and may keep an environment.
 
-    It is called with the episode's specification and a seed that no other attempt of
-    the collection has, and everything it draws must come from the two. It returns the
-    episode's arrays, or None where the attempt failed and is to be made again with
-    another seed. A `close()` method, where there is one, is called at the end.
+    A call gets the specification of the episode and a seed that no other attempt of the
+    collection gets, and everything random must come from the two. It returns the arrays
+    of the episode, or ``None`` if the attempt failed and is to be repeated with another
+    seed. If the source has a ``close()`` method, it is called at the end.
     """
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> EpisodeArrays | None:
-        """Return the arrays of the episode, or None for a failed attempt."""
+        """Returns the arrays of the episode, or ``None`` for a failed attempt."""
         ...
 
 
@@ -60,10 +55,12 @@ class CollectionReport:
     """What a collection did.
 
     Attributes:
-        files: the episodes' files, in the order of the specifications.
-        collected: episodes made by this call.
-        reused: episodes that were there before it.
-        failures: failed attempts per specification, of this call and earlier ones.
+        files (tuple of Path): the files of the episodes, in the order of the
+            specifications.
+        collected (int): the number of episodes that this call collected.
+        reused (int): the number of episodes that were in the folder before.
+        failures (tuple of int): the number of failed attempts for each specification,
+            in this call and earlier ones.
     """
 
     files: tuple[Path, ...]
@@ -73,7 +70,7 @@ class CollectionReport:
 
     @property
     def success_rate(self) -> float:
-        """Share of attempts that succeeded."""
+        """The share of attempts that succeeded."""
         return len(self.files) / max(len(self.files) + sum(self.failures), 1)
 
 
@@ -88,39 +85,42 @@ def collect_episodes(
     progress: bool = True,
     description: str = "episodes",
 ) -> CollectionReport:
-    """Make one episode per specification and keep each in a file of its own.
+    """Collects one episode per specification, each in a file of its own.
 
-    Finished episodes stay in `folder` whatever happens to the rest: called again with
-    the same arguments, the collection goes on with those that are missing. An
-    episode depends on `seed`, its position in `specs` and the number of the attempt
-    alone, so any number of workers gives the same files. Workers are started by
-    `spawn`: a script needs the usual `if __name__ == "__main__":`.
+    An interrupted collection resumes: a call with the same arguments collects only the
+    episodes that ``folder`` lacks. An episode depends only on ``seed``, its position in
+    ``specs`` and the number of the attempt, so the files are the same for any number of
+    workers. Workers are started by ``spawn``, so a script needs the usual
+    ``if __name__ == "__main__":``.
 
     Args:
-        factory: makes an `EpisodeSource`; must be picklable where `workers` > 1 (a
-            module's function, a class, an instance of a frozen dataclass).
-        specs: what each episode shall be, as JSON values.
-        folder: where the episodes' files go; made where missing.
+        factory (callable): makes an :class:`EpisodeSource` in each process. With more
+            than one worker it must be picklable: a function of a module, a class, or a
+            ``functools.partial`` of one.
+        specs (sequence of mapping): a specification for each episode, in JSON values.
+        folder (path): the folder for the files; created if it is missing.
 
     Keyword Args:
-        seed: seed of the whole collection.
-        workers: number of processes; as many as there are processors where None; with
-            1 the episodes are made in this process.
-        max_attempts: attempts per episode.
-        progress: show a progress bar.
-        description: what the bar counts.
+        seed (int): the seed of the collection. Defaults to 0.
+        workers (int, optional): the number of processes. With 1, the episodes are
+            collected in this process. Defaults to one per processor.
+        max_attempts (int): the number of attempts per episode. Defaults to 20.
+        progress (bool): if ``True``, shows a progress bar. Defaults to ``True``.
+        description (str): what the progress bar counts. Defaults to ``"episodes"``.
 
     Returns:
-        the files and the numbers of attempts.
+        CollectionReport: the files and the numbers of attempts.
 
     Raises:
-        ValueError: `folder` holds another collection, or a file in it is unreadable.
-        RuntimeError: an episode failed in all attempts, or a worker broke off; episodes
-            that were finished stay.
+        ValueError: ``folder`` has another collection, or an unreadable file.
+        RuntimeError: all attempts for an episode failed, or a worker process ended.
+        Exception: whatever a source raised, with the traceback of the worker. Finished
+            episodes are kept.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> import numpy as np
+        >>> from torchrl_caiac.data import collect_episodes, load_episode
         >>> def factory():
         ...     def source(spec, seed):
         ...         return {"actions": np.full((spec["steps"], 2), seed % 7)}
@@ -134,54 +134,49 @@ def collect_episodes(
         ((4, 2), 1)
     """
     if max_attempts < 1:
-        raise ValueError(f"max_attempts is {max_attempts}, wanted at least 1")
+        raise ValueError(f"max_attempts is {max_attempts}, expected at least 1")
     if workers is None:
-        workers = (
-            len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count() or 1
-        )
+        workers = available_processors()
     if workers < 1:
-        raise ValueError(f"workers is {workers}, wanted at least 1")
+        raise ValueError(f"workers is {workers}, expected at least 1")
     root = Path(folder)
     _claim_folder(root, seed, specs)
     files = [root / f"episode_{index:06d}.npz" for index in range(len(specs))]
-    missing = []
-    failures = [0] * len(specs)
-    for index, file in enumerate(files):
-        if file.exists():
-            failures[index] = _read_meta(file)["attempts"] - 1
-        else:
-            missing.append(index)
+    failures = {
+        index: _read_meta(file)["attempts"] - 1
+        for index, file in enumerate(files)
+        if file.exists()
+    }
+    missing = [index for index in range(len(specs)) if index not in failures]
     jobs = [
-        _Job(index, dict(specs[index]), seed, str(files[index]), max_attempts)
+        (dict(specs[index]), index, files[index], seed, max_attempts)
         for index in missing
     ]
 
     from tqdm import tqdm
 
-    bar = tqdm(
-        total=len(specs),
-        initial=len(specs) - len(jobs),
-        desc=description,
-        disable=not progress,
-    )
-    with bar:
-        results = (
-            _serial(factory, jobs)
-            if workers == 1 or len(jobs) <= 1
-            else _parallel(factory, jobs, min(workers, len(jobs)))
-        )
-        for index, attempts in results:
-            failures[index] = attempts - 1
+    with tqdm(
+        total=len(specs), initial=len(failures), desc=description, disable=not progress
+    ) as bar:
+        processes = min(workers, len(jobs))
+        for number, attempts in run_in_processes(
+            _collect_episode,
+            jobs,
+            processes=processes if processes > 1 else 0,
+            setup=factory,
+        ):
+            failures[missing[number]] = attempts - 1
             bar.update()
     report = CollectionReport(
-        tuple(files), len(jobs), len(specs) - len(jobs), tuple(failures)
+        files=tuple(files),
+        collected=len(jobs),
+        reused=len(specs) - len(jobs),
+        failures=tuple(failures[index] for index in range(len(specs))),
     )
-    logger.info(
-        "%d %s collected, %d there before, %d attempts failed",
-        report.collected,
+    _logger.info(
+        "%s: collected %d, reused %d, %d attempts failed",
         description,
+        report.collected,
         report.reused,
         sum(report.failures),
     )
@@ -191,18 +186,30 @@ def collect_episodes(
 def load_episode(
     file: str | os.PathLike[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read an episode's file.
+    """Reads the file of an episode.
 
     Args:
-        file: a file that `collect_episodes` wrote.
+        file (path): a file that :func:`collect_episodes` wrote.
 
     Returns:
-        the arrays, nested as they were, and what is known about the episode: "spec",
-        "seed", "attempts".
+        tuple[dict, dict]: the arrays, nested as the source returned them, and the
+        ``"spec"``, the ``"seed"`` and the ``"attempts"`` of the episode.
 
     Raises:
-        ValueError: the file is truncated or not an episode; delete it and collect
-            again.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is truncated or is not an episode.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_caiac.data import collect_episodes, load_episode
+        >>> def factory():
+        ...     return lambda spec, seed: {"infos": {"goal": np.zeros(spec["width"])}}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     report = collect_episodes(
+        ...         factory, [{"width": 2}], folder, workers=1, progress=False)
+        ...     load_episode(report.files[0])[0]
+        {'infos': {'goal': array([0., 0.])}}
     """
     path = Path(file)
     meta = _read_meta(path)
@@ -231,26 +238,39 @@ def record_episode(
     stop: Callable[[dict[str, Any]], bool] | None = None,
     state: Callable[[], Mapping[str, NDArray[Any]]] | None = None,
 ) -> dict[str, Any]:
-    """Play an episode and keep what a Minari episode keeps.
+    """Plays an episode and returns the arrays of a Minari episode.
 
     Args:
-        env: a Gymnasium environment that has just been reset.
-        policy: action for an observation.
-        observation: the first observation.
+        env (gymnasium.Env): an environment that has just been reset.
+        policy (callable): returns the action for an observation.
+        observation (Any): the first observation.
 
     Keyword Args:
-        max_steps: number of steps after which the episode is truncated.
-        stop: called with the step's info after each step; ends the episode (as
-            truncated) where it returns True.
-        state: what to record of the simulator with every observation.
+        max_steps (int): the number of steps after which the episode is truncated.
+        stop (callable, optional): gets the info of each step; if it returns ``True``,
+            the episode is truncated there.
+        state (callable, optional): returns what to record of the simulator with every
+            observation.
 
     Returns:
-        "observations" (and "infos", where `state` is given) with one entry more than
-        "actions" `[L, A]`, "rewards" `[L]`, "terminations" `[L]`, "truncations"
-        `[L]`.
+        dict: ``"actions"`` ``[L, A]``, ``"rewards"``, ``"terminations"`` and
+        ``"truncations"`` ``[L]``, and ``"observations"`` (and ``"infos"``, if ``state``
+        is given) with ``L + 1`` entries.
+
+    Raises:
+        ValueError: ``max_steps`` is less than 1.
+
+    Examples:
+        >>> import gymnasium
+        >>> from torchrl_caiac.data import record_episode
+        >>> env = gymnasium.make("CartPole-v1")
+        >>> observation, _ = env.reset(seed=0)
+        >>> episode = record_episode(env, lambda _: 0, observation, max_steps=5)
+        >>> episode["observations"].shape, episode["truncations"].tolist()
+        ((6, 4), [False, False, False, False, True])
     """
     if max_steps < 1:
-        raise ValueError(f"max_steps is {max_steps}, wanted at least 1")
+        raise ValueError(f"max_steps is {max_steps}, expected at least 1")
     observations = [_copied(observation)]
     infos = [] if state is None else [_copied(state())]
     actions, rewards, terminations, truncations = [], [], [], []
@@ -282,7 +302,7 @@ def record_episode(
 
 
 def _copied(value: Any) -> Any:
-    # Some environments hand out views of simulator memory.
+    # Some environments return views of simulator memory.
     if isinstance(value, Mapping):
         return {key: _copied(entry) for key, entry in value.items()}
     return np.array(value)
@@ -294,132 +314,36 @@ def _stacked(values: Sequence[Any]) -> Any:
     return np.stack(values)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Job:
-    index: int
-    spec: dict[str, Any]
-    seed: int
-    file: str
-    max_attempts: int
-
-
-def _make(source: EpisodeSource, job: _Job) -> int:
-    """Make and store one episode; return the number of attempts."""
-    for attempt in range(job.max_attempts):
-        words = np.random.SeedSequence([job.seed, job.index, attempt])
-        # 31 bits: within what every library takes as a seed.
+def _collect_episode(
+    source: EpisodeSource,
+    spec: Mapping[str, Any],
+    index: int,
+    file: Path,
+    collection_seed: int,
+    max_attempts: int,
+) -> int:
+    """Collects and stores one episode; returns the number of attempts."""
+    for attempt in range(max_attempts):
+        words = np.random.SeedSequence([collection_seed, index, attempt])
+        # 31 bits: every library takes them as a seed.
         seed = int(words.generate_state(1)[0] >> 1)
-        arrays = source(job.spec, seed)
-        if arrays is not None:
-            meta = {"spec": job.spec, "seed": seed, "attempts": attempt + 1}
-            _write(Path(job.file), arrays, meta)
-            return attempt + 1
+        arrays = source(spec, seed)
+        if arrays is None:
+            continue
+        flat = _flat(arrays)
+        meta = {"spec": spec, "seed": seed, "attempts": attempt + 1}
+        flat[_META] = np.array(json.dumps(meta))
+        with whole_file(file) as partial:
+            np.savez(partial, **flat)  # type: ignore[arg-type]
+        return attempt + 1
     raise RuntimeError(
-        f"episode {job.index} ({job.spec}) failed in all {job.max_attempts} attempts; "
-        "make the task easier or raise max_attempts"
+        f"episode {index} ({spec}) failed in all {max_attempts} attempts: make the "
+        "task easier or raise max_attempts"
     )
 
 
-def _serial(
-    factory: Callable[[], EpisodeSource], jobs: Sequence[_Job]
-) -> Iterator[tuple[int, int]]:
-    if not jobs:
-        return
-    source = factory()
-    try:
-        for job in jobs:
-            yield job.index, _make(source, job)
-    finally:
-        _close(source)
-
-
-def _parallel(
-    factory: Callable[[], EpisodeSource], jobs: Sequence[_Job], workers: int
-) -> Iterator[tuple[int, int]]:
-    context = multiprocessing.get_context("spawn")
-    waiting: Any = context.Queue()
-    finished: Any = context.Queue()
-    for job in jobs:
-        waiting.put(job)
-    for _ in range(workers):
-        waiting.put(None)
-    processes = [
-        context.Process(target=_work, args=(factory, waiting, finished), daemon=True)
-        for _ in range(workers)
-    ]
-    # Linear algebra threads of two workers on two cores only get in each other's way;
-    # the libraries read this when they are loaded, so it must be set before the start.
-    previous = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        for process in processes:
-            process.start()
-    finally:
-        for name, value in previous.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-    done = 0
-    try:
-        ended = False
-        while done < len(jobs):
-            try:
-                index, attempts, error = finished.get(timeout=_POLL_SECONDS)
-            except queue.Empty:
-                if ended:
-                    codes = [process.exitcode for process in processes]
-                    raise RuntimeError(
-                        f"collecting processes ended (exit codes {codes}) before their "
-                        "episodes were done; finished episodes are kept, call again "
-                        "to go on"
-                    ) from None
-                # What they sent may still be on its way: look once more.
-                ended = any(p.exitcode not in (None, 0) for p in processes) or all(
-                    p.exitcode is not None for p in processes
-                )
-                continue
-            if error is not None:
-                raise RuntimeError(f"a collecting process failed:\n{error}")
-            done += 1
-            yield index, attempts
-        for process in processes:
-            process.join()
-    finally:
-        for process in processes:
-            if process.is_alive():
-                process.terminate()
-                process.join()
-        for channel in (waiting, finished):
-            channel.cancel_join_thread()
-            channel.close()
-
-
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def _work(factory: Callable[[], EpisodeSource], waiting: Any, finished: Any) -> None:
-    end_with_parent()
-    source = None
-    try:
-        source = factory()
-        while (job := waiting.get()) is not None:
-            finished.put((job.index, _make(source, job), None))
-    except Exception:
-        finished.put((-1, 0, traceback.format_exc()))
-    finally:
-        if source is not None:
-            _close(source)
-
-
-def _close(source: EpisodeSource) -> None:
-    close = getattr(source, "close", None)
-    if close is not None:
-        close()
-
-
 def _claim_folder(root: Path, seed: int, specs: Sequence[Mapping[str, Any]]) -> None:
-    """Write what the folder is for, or check that it is for this collection."""
+    """Writes which collection the folder is for, or checks that it is for this one."""
     text = json.dumps([dict(spec) for spec in specs], sort_keys=True)
     manifest = {
         "seed": seed,
@@ -427,7 +351,6 @@ def _claim_folder(root: Path, seed: int, specs: Sequence[Mapping[str, Any]]) -> 
         "specs_sha256": hashlib.sha256(text.encode()).hexdigest(),
     }
     path = root / _MANIFEST
-    root.mkdir(parents=True, exist_ok=True)
     if path.exists():
         try:
             found = json.loads(path.read_text())
@@ -435,16 +358,16 @@ def _claim_folder(root: Path, seed: int, specs: Sequence[Mapping[str, Any]]) -> 
             raise _unreadable(path, error) from error
         if found != manifest:
             raise ValueError(
-                f"{root} holds another collection: found {found}, wanted {manifest}; "
+                f"{root} has another collection: found {found}, expected {manifest}; "
                 "give another folder or delete this one"
             )
         return
     if any(root.glob("episode_*.npz")):
         raise ValueError(
-            f"{root} holds episodes but no {_MANIFEST}, so it cannot be told which "
-            "collection they belong to; give another folder or delete this one"
+            f"{root} has episodes but no {_MANIFEST}, so their collection is unknown: "
+            "give another folder or delete this one"
         )
-    _replace(path, lambda file: file.write(json.dumps(manifest).encode()))
+    write_json(path, manifest)
 
 
 def _flat(arrays: EpisodeArrays, prefix: str = "") -> dict[str, NDArray[Any]]:
@@ -452,8 +375,8 @@ def _flat(arrays: EpisodeArrays, prefix: str = "") -> dict[str, NDArray[Any]]:
     for key, value in arrays.items():
         if _SEPARATOR in key or (not prefix and key == _META):
             raise ValueError(
-                f"an episode's key is {key!r}; {_SEPARATOR!r} and the name {_META!r} "
-                "are used by the file format"
+                f"an episode's key is {key!r}, but the file format reserves "
+                f"{_SEPARATOR!r} and the name {_META!r}: rename it"
             )
         if isinstance(value, Mapping):
             flat.update(_flat(value, f"{prefix}{key}{_SEPARATOR}"))
@@ -461,28 +384,11 @@ def _flat(arrays: EpisodeArrays, prefix: str = "") -> dict[str, NDArray[Any]]:
             array = np.asarray(value)
             if array.dtype == object:
                 raise ValueError(
-                    f"episode key {prefix + key!r} holds Python objects, wanted numbers"
+                    f"episode key {prefix + key!r} has Python objects, expected an "
+                    "array of numbers"
                 )
             flat[prefix + key] = array
     return flat
-
-
-def _write(path: Path, arrays: EpisodeArrays, meta: Mapping[str, Any]) -> None:
-    flat = _flat(arrays)
-    flat[_META] = np.array(json.dumps(meta))
-    _replace(path, lambda file: np.savez(file, **flat))  # type: ignore[arg-type]
-
-
-def _replace(path: Path, write: Callable[[Any], Any]) -> None:
-    """Write a file so that it is there whole or not at all."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".partial-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -499,5 +405,5 @@ def _read_meta(path: Path) -> dict[str, Any]:
 def _unreadable(path: Path, error: Exception) -> ValueError:
     return ValueError(
         f"{path} is truncated or was not written by this collection "
-        f"({type(error).__name__}: {error}); delete it and collect again"
+        f"({type(error).__name__}: {error}): delete it and collect again"
     )

@@ -191,7 +191,7 @@ def test_a_dataset_is_replaced_only_with_overwrite(expert, root, work):
         "overwrite": True,
         "progress": False,
     }
-    with pytest.raises(ValueError, match="holds another collection"):
+    with pytest.raises(ValueError, match="has another collection"):
         create_fetch_push_expert(steps=STEPS + 1, **arguments)
     # A missing file is collected again, and is the same.
     (work / "fetch-push-2-expert-v0" / "episode_000001.npz").unlink()
