@@ -1,4 +1,4 @@
-"""Jobs in processes of their own."""
+"""Running jobs in separate processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ import torch
 __all__ = [
     "available_processors",
     "bar_position",
-    "end_with_parent",
     "run_in_processes",
 ]
 
@@ -32,7 +31,10 @@ _setup_error: Exception | None = None
 
 
 def available_processors() -> int:
-    """The processors that this process may use.
+    """Returns the number of processors that this process may use.
+
+    Returns:
+        int: at least 1.
 
     Examples:
         >>> from torchrl_caiac._processes import available_processors
@@ -45,7 +47,7 @@ def available_processors() -> int:
 
 
 def bar_position() -> int:
-    """The line for the progress bars of this process.
+    """Returns the line for the progress bars of this process.
 
     Returns:
         int: ``position=`` for ``tqdm``; 0 outside of :func:`run_in_processes`.
@@ -78,7 +80,7 @@ def run_in_processes(
         jobs (iterable of tuple): the arguments of each job.
 
     Keyword Args:
-        processes (int): how many run at a time; with 0 the jobs run in this process,
+        processes (int): the number of processes; with 0 the jobs run in this process,
             one after another. Defaults to 2.
         setup (callable, optional): called once in each process. ``function`` gets its
             result as the first argument; it is closed at the end if it has ``close``.
@@ -132,8 +134,8 @@ def run_in_processes(
             yield from sorted(finished)
     except BrokenProcessPool as error:
         raise RuntimeError(
-            "a process ended in the middle of a job, killed for lack of memory "
-            "perhaps: finished jobs are kept, call again to resume"
+            "a process ended in the middle of a job, perhaps killed for lack of "
+            "memory: files of finished jobs are kept, call again to resume"
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
@@ -193,7 +195,7 @@ def _can_be_pickled(error: Exception) -> bool:
 
 def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:
     global _worker, _setup_error
-    end_with_parent()
+    _end_with_parent()
     with counter.get_lock():
         os.environ[_POSITION] = str(counter.value)
         counter.value += 1
@@ -202,18 +204,18 @@ def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:
         return
     try:
         made = setup()
-    except Exception as error:  # raised here, it would break the pool without a word
+    except Exception as error:  # raised here, it would break the pool without a reason
         _setup_error = error
         return
     Finalize(None, _close, (made,), exitpriority=0)
     _worker = (made,)
 
 
-def end_with_parent() -> None:
+def _end_with_parent() -> None:
     """Lets this process end as soon as the one that started it has ended.
 
-    Without it, a process whose parent was killed would wait for work for ever, or go on
-    writing beside the parent's successor.
+    Otherwise a process whose parent was killed would wait for work forever, or continue
+    to write while the parent's successor does.
     """
     parent = multiprocessing.parent_process()
     if parent is None:

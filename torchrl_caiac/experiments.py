@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_caiac._files import claim_folder, plain, whole_file, write_json
-from torchrl_caiac._processes import bar_position, end_with_parent
+from torchrl_caiac._processes import bar_position
 from torchrl_caiac._processes import run_in_processes as run_side_by_side
 
 __all__ = [
     "bar_position",
     "claim_folder",
-    "end_with_parent",
     "keep_settings",
     "quick_settings",
     "run_side_by_side",

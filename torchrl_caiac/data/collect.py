@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from torchrl_caiac._files import whole_file, write_json
 from torchrl_caiac._processes import available_processors, run_in_processes
+from torchrl_caiac.data.trees import copy_tree, stack_trees
 
 __all__ = [
     "CollectionReport",
@@ -271,15 +272,15 @@ def record_episode(
     """
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}, expected at least 1")
-    observations = [_copied(observation)]
-    infos = [] if state is None else [_copied(state())]
+    observations = [copy_tree(observation)]
+    infos = [] if state is None else [copy_tree(state())]
     actions, rewards, terminations, truncations = [], [], [], []
     for step in range(max_steps):
         action = np.array(policy(observation))
         observation, reward, terminated, truncated, info = env.step(action)
-        observations.append(_copied(observation))
+        observations.append(copy_tree(observation))
         if state is not None:
-            infos.append(_copied(state()))
+            infos.append(copy_tree(state()))
         over = terminated or truncated
         if not over:
             truncated = step + 1 == max_steps or (stop is not None and stop(info))
@@ -290,28 +291,15 @@ def record_episode(
         if terminated or truncated:
             break
     episode = {
-        "observations": _stacked(observations),
+        "observations": stack_trees(observations),
         "actions": np.stack(actions),
         "rewards": np.array(rewards),
         "terminations": np.array(terminations),
         "truncations": np.array(truncations),
     }
     if state is not None:
-        episode["infos"] = _stacked(infos)
+        episode["infos"] = stack_trees(infos)
     return episode
-
-
-def _copied(value: Any) -> Any:
-    # Some environments return views of simulator memory.
-    if isinstance(value, Mapping):
-        return {key: _copied(entry) for key, entry in value.items()}
-    return np.array(value)
-
-
-def _stacked(values: Sequence[Any]) -> Any:
-    if isinstance(values[0], Mapping):
-        return {key: _stacked([value[key] for value in values]) for key in values[0]}
-    return np.stack(values)
 
 
 def _collect_episode(
