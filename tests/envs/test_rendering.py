@@ -9,14 +9,14 @@ from torchrl_caiac.envs.kitchen import KitchenEnv
 from torchrl_caiac.envs.rendering import RenderingUnavailable
 
 
-def test_frames_or_a_clear_word():
+def test_frames_or_a_clear_error():
     env = KitchenEnv(render_mode="rgb_array", render_size=(64, 48))
     env.reset(seed=0)
     before = env.qpos
     try:
         frame = env.render()
     except RenderingUnavailable as error:
-        # A machine without OpenGL: the message is all there is to see.
+        # A machine without OpenGL: only the message can be tested.
         assert "apt-get install" in str(error)
         return
     assert frame.shape == (48, 64, 3) and frame.dtype == np.uint8
@@ -31,7 +31,7 @@ def test_frames_or_a_clear_word():
     with pytest.raises(ValueError, match=r"\[S, 30\]"):
         env.render_states(np.zeros((2, 21)))
     env.close()
-    assert np.array_equal(env.render(), frame)  # comes back after close
+    assert np.array_equal(env.render(), frame)  # works again after close
     env.close()
     env.close()
 
@@ -45,12 +45,12 @@ def test_no_render_mode_no_frame():
 @pytest.mark.parametrize(
     ("variable", "value"), [("MUJOCO_GL", "disabled"), ("MUJOCO_EGL_DEVICE_ID", "99")]
 )
-def test_without_opengl_the_environment_goes_on(monkeypatch, variable, value):
+def test_the_environment_works_without_opengl(monkeypatch, variable, value):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setenv(variable, value)
     egl = sys.modules.get("mujoco.egl")
-    if egl is not None:  # a display found by an earlier test is kept there
+    if egl is not None:  # it keeps a display that an earlier test found
         monkeypatch.setattr(egl, "EGL_DISPLAY", None)
     env = KitchenEnv(render_mode="rgb_array")
     env.reset(seed=0)

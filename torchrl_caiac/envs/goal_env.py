@@ -1,4 +1,4 @@
-"""A gymnasium environment of this package as a TorchRL environment."""
+"""Gymnasium environments of this package as TorchRL environments."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ __all__ = ["make_goal_env"]
 def make_goal_env(
     env_id: str, info: Mapping[str, TensorSpec], *, device: Any = "cpu", **kwargs: Any
 ) -> EnvBase:
-    """Make a registered environment with some of its info as leaves.
+    """Creates a registered environment and reads entries of its info.
 
     Args:
-        env_id: gymnasium's name of it.
-        info: the entries of its info to read, with their specs.
+        env_id (str): gymnasium's name of the environment.
+        info (Mapping of str to TensorSpec): the entries of its info to read, with
+            their specs.
 
     Keyword Args:
-        device: where tensors go.
-        **kwargs: of the environment.
+        device (torch.device or str): device of the tensors. Defaults to ``"cpu"``.
+        **kwargs (Any): passed to the environment.
 
     Returns:
-        a ``TransformedEnv`` with ``"is_init"``.
+        TransformedEnv: the environment, with ``"is_init"``.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from torchrl.data import Binary
         >>> import torchrl_caiac.envs  # registers

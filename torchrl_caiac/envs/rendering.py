@@ -1,4 +1,4 @@
-"""Off-screen frames of MuJoCo environments, where there is OpenGL."""
+"""Off-screen rendering of MuJoCo environments."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ except (ImportError, AttributeError) as error:
     raise ImportError(
         "mujoco could not be imported. If MUJOCO_GL is set (it is "
         f"{os.environ.get('MUJOCO_GL')!r}), its OpenGL libraries may be missing: unset "
-        "it (the kitchen runs without OpenGL and looks for it only to render), or "
+        "it (the environments use OpenGL only to render), or "
         "install them (`apt-get install libegl1 libgl1-mesa-dri`). Otherwise: "
         "pip install 'torchrl-caiac[envs]'"
     ) from error
@@ -30,28 +30,29 @@ __all__ = ["OffscreenRenderer", "RenderingUnavailable"]
 
 
 class RenderingUnavailable(RuntimeError):
-    """No OpenGL context could be made; the message says how to get one."""
+    """No OpenGL context could be created; the message says how to get one."""
 
 
 class OffscreenRenderer:
-    """Frames of a model, in an OpenGL context of its own.
+    """Renders frames of a model in an OpenGL context of its own.
 
     Shadows and reflections are off: in software they cost ten times the rest.
 
-    ``mujoco.Renderer`` takes the backend that ``MUJOCO_GL`` named when mujoco was
-    imported. This one looks for a backend when it is made, so that nothing needs to be
-    set before the import, and environments work where there is no OpenGL.
+    ``mujoco.Renderer`` uses the backend that ``MUJOCO_GL`` named when mujoco was
+    imported. This class looks for a backend when it is created, so nothing needs to be
+    set before the import, and environments work without OpenGL.
 
     Args:
-        model: the MuJoCo model.
-        width: of the frames, in pixels.
-        height: of the frames, in pixels.
+        model (mujoco.MjModel): the model.
+        width (int): width of the frames, in pixels.
+        height (int): height of the frames, in pixels.
 
     Keyword Args:
-        camera: attributes of ``mujoco.MjvCamera`` (``lookat``, ``distance``, ...).
+        camera (Mapping, optional): attributes of ``mujoco.MjvCamera`` (``lookat``,
+            ``distance``, ...).
 
     Raises:
-        RenderingUnavailable: no OpenGL context could be made.
+        RenderingUnavailable: no OpenGL context could be created.
     """
 
     def __init__(
@@ -81,15 +82,18 @@ class OffscreenRenderer:
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
         self._free = weakref.finalize(self, _free, self._mjr, self._context)
-        # Exit functions run last in, first out: this one comes before EGL's own, which
-        # finalize cannot promise.
+        # Exit functions run last in, first out: this one runs before EGL's own, which
+        # finalize does not guarantee.
         atexit.register(self._free)
 
     def frame(self, data: Any) -> NDArray[np.uint8]:
-        """Return the RGB frame ``[height, width, 3]`` of a simulator state.
+        """Renders a simulator state.
 
         Args:
-            data: the ``mujoco.MjData``, brought up to date by ``mj_forward``.
+            data (mujoco.MjData): the state, updated by ``mj_forward``.
+
+        Returns:
+            numpy.ndarray: RGB frame ``[height, width, 3]``, uint8.
         """
         self._context.make_current()
         mujoco.mjv_updateScene(
@@ -109,7 +113,7 @@ class OffscreenRenderer:
         return np.flipud(pixels).copy()  # OpenGL's first row is the lowest
 
     def close(self) -> None:
-        """Free the context. Garbage collection and the interpreter's exit do too."""
+        """Frees the context; so do garbage collection and the interpreter's exit."""
         self._free()
         atexit.unregister(self._free)
 
@@ -120,31 +124,31 @@ def _free(mjr: Any, context: Any) -> None:
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """Return an OpenGL context of the first backend that works."""
-    asked = os.environ.get("MUJOCO_GL", "").lower()
-    if asked in ("egl", "osmesa", "glfw"):
-        backends: tuple[str, ...] = (asked,)
-    elif asked in ("disable", "disabled", "off", "false", "0"):
+    """Returns an OpenGL context of the first backend that works."""
+    requested = os.environ.get("MUJOCO_GL", "").lower()
+    if requested in ("egl", "osmesa", "glfw"):
+        backends: tuple[str, ...] = (requested,)
+    elif requested in ("disable", "disabled", "off", "false", "0"):
         backends = ()
     elif sys.platform == "linux":
         backends = ("egl", "glfw") if os.environ.get("DISPLAY") else ("egl",)
     else:
         backends = ("glfw",)
-    reasons = [] if backends else [f"MUJOCO_GL is {asked!r}"]
+    reasons = [] if backends else [f"MUJOCO_GL is {requested!r}"]
     for backend in backends:
         try:
             kind = importlib.import_module(f"mujoco.{backend}").GLContext
             context = kind.__new__(kind)
-            # Its __del__ reads this, also where __init__ failed before writing it.
+            # Its __del__ reads this, even if __init__ failed before setting it.
             context._context = None
             context.__init__(width, height)
             return context
-        # What a missing driver raises differs by its loader: ImportError,
-        # AttributeError, RuntimeError, OpenGL's own errors.
+        # A missing driver raises different errors, depending on its loader:
+        # ImportError, AttributeError, RuntimeError, OpenGL's own errors.
         except Exception as error:
             reasons.append(f"{backend}: {type(error).__name__}: {error}")
     raise RenderingUnavailable(
-        f"frames need OpenGL, and no context could be made ({'; '.join(reasons)}). On "
-        "Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri; then leave "
-        "MUJOCO_GL unset or set it to egl"
+        "rendering needs OpenGL, and no context could be created "
+        f"({'; '.join(reasons)}). On Debian or Ubuntu: apt-get install libegl1 "
+        "libgl1-mesa-dri; then leave MUJOCO_GL unset or set it to egl"
     )

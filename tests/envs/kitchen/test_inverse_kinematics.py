@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_caiac.envs.kitchen.inverse_kinematics import (
     InverseKinematics,
+    rotation_matrix,
     rotation_vector,
 )
 
@@ -78,6 +79,8 @@ def test_rotation_vector_agrees_with_scipy(axis, angle):
     rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
     found = rotation_vector(rotation.as_matrix())
     np.testing.assert_allclose(found, rotation.as_rotvec(), atol=1e-6)
+    matrix = rotation_matrix(rotation.as_rotvec())
+    np.testing.assert_allclose(matrix, rotation.as_matrix(), atol=1e-6)
 
 
 def test_rotation_vector_at_half_turn_and_wrong_shape():
@@ -171,7 +174,7 @@ def test_bad_input(model, solver):
         InverseKinematics(model, "tip", ["a", "z"])
     with pytest.raises(ValueError, match="several degrees of freedom"):
         InverseKinematics(model, "tip", ["loose"])
-    with pytest.raises(ValueError, match=r"shape \(1, 2\), wanted \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"shape \(1, 2\), expected \(2, 2\)"):
         InverseKinematics(model, "tip", ["a", "b"], limits=[(0, 1)])
     with pytest.raises(ValueError, match="finite"):
         solver.solve(start(model), (np.nan, 0, 0))

@@ -1,7 +1,8 @@
-"""The Franka-Kitchen: environment, scripted expert and datasets."""
+"""The Franka-Kitchen: environment, ground truth, scripted expert and datasets."""
 
 from __future__ import annotations
 
+from torchrl_caiac.envs.kitchen.chain import KitchenChain
 from torchrl_caiac.envs.kitchen.datasets import (
     DEMONSTRATIONS_ID,
     MICROWAVE_KETTLE,
@@ -15,17 +16,21 @@ from torchrl_caiac.envs.kitchen.datasets import (
     kitchen_transitions,
     load_d4rl_kitchen,
 )
-from torchrl_caiac.envs.kitchen.env import (
+from torchrl_caiac.envs.kitchen.env import KitchenEnv
+from torchrl_caiac.envs.kitchen.expert import KitchenExpert
+from torchrl_caiac.envs.kitchen.registration import (
     KITCHEN_ENV_ID,
-    KITCHEN_TASKS,
-    KitchenEnv,
-    KitchenState,
-    kitchen_distances,
-    kitchen_reward,
     make_kitchen_env,
     register_kitchen,
 )
-from torchrl_caiac.envs.kitchen.expert import KitchenChain, KitchenExpert
+from torchrl_caiac.envs.kitchen.simulator import KitchenState
+from torchrl_caiac.envs.kitchen.starts import set_kitchen_start
+from torchrl_caiac.envs.kitchen.tasks import (
+    KITCHEN_TASKS,
+    kitchen_distances,
+    kitchen_reward,
+)
+from torchrl_caiac.envs.kitchen.truth import KitchenTruth
 
 __all__ = [
     "DEMONSTRATIONS_ID",
@@ -40,6 +45,7 @@ __all__ = [
     "KitchenEnv",
     "KitchenExpert",
     "KitchenState",
+    "KitchenTruth",
     "create_kitchen_demonstrations",
     "create_kitchen_play",
     "create_kitchen_random",
@@ -49,4 +55,5 @@ __all__ = [
     "load_d4rl_kitchen",
     "make_kitchen_env",
     "register_kitchen",
+    "set_kitchen_start",
 ]

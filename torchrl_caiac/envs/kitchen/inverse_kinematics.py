@@ -11,19 +11,20 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["IKSolution", "InverseKinematics", "rotation_vector"]
+__all__ = ["IKSolution", "InverseKinematics", "rotation_matrix", "rotation_vector"]
 
 _SMALL_ANGLE = 1e-7
 
 
 class IKSolution(NamedTuple):
-    """A joint configuration and how far it leaves the tool from its target.
+    """A joint configuration and the remaining error of the tool's pose.
 
     Attributes:
-        joints: joint positions `[J]` in radians (metres for sliding joints).
-        position_error: distance of the tool point to its target, in metres.
-        rotation_error: angle between tool and target orientation, in radians
-            (0 where no orientation was asked for).
+        joints (numpy.ndarray): joint positions ``[J]`` in radians (metres for sliding
+            joints).
+        position_error (float): distance of the tool point to its target, in metres.
+        rotation_error (float): angle between tool and target orientation, in radians
+            (0 where no orientation was requested).
     """
 
     joints: NDArray[np.float64]
@@ -32,16 +33,19 @@ class IKSolution(NamedTuple):
 
 
 def rotation_vector(rotation: ArrayLike) -> NDArray[np.float64]:
-    """Return axis times angle of a rotation matrix.
+    """Returns axis times angle of a rotation matrix.
 
     Args:
-        rotation: rotation matrix `[3, 3]`.
+        rotation (ArrayLike): rotation matrix ``[3, 3]``.
 
     Returns:
-        vector `[3]` whose direction is the axis and whose length is the angle, in
-        radians, between 0 and pi.
+        numpy.ndarray: vector ``[3]``. Its direction is the axis; its length is the
+        angle, in radians, between 0 and pi.
 
-    Example:
+    Raises:
+        ValueError: the matrix has another shape.
+
+    Examples:
         >>> import numpy as np
         >>> turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         >>> rotation_vector(turn).round(4).tolist()
@@ -49,7 +53,7 @@ def rotation_vector(rotation: ArrayLike) -> NDArray[np.float64]:
     """
     matrix = np.asarray(rotation, dtype=np.float64)
     if matrix.shape != (3, 3):
-        raise ValueError(f"rotation has shape {matrix.shape}, wanted (3, 3)")
+        raise ValueError(f"rotation has shape {matrix.shape}, expected (3, 3)")
     # The quaternion's largest component first: stable at every angle, pi included.
     diagonal = np.diag(matrix)
     squares = np.concatenate([[diagonal.sum()], 2 * diagonal - diagonal.sum()]) + 1
@@ -79,38 +83,66 @@ def rotation_vector(rotation: ArrayLike) -> NDArray[np.float64]:
     return quaternion[1:] * (2 * np.arctan2(sine, quaternion[0]) / sine)
 
 
+def rotation_matrix(vector: ArrayLike) -> NDArray[np.float64]:
+    """Returns the rotation matrix of a rotation vector.
+
+    Args:
+        vector (ArrayLike): axis times angle, ``[3]``, radians.
+
+    Returns:
+        numpy.ndarray: rotation matrix ``[3, 3]``.
+
+    Examples:
+        >>> import numpy as np
+        >>> rotation_matrix([0.0, 0.0, np.pi / 2]).round(4).tolist()
+        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    vector = np.asarray(vector, dtype=np.float64)
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-9:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
 class InverseKinematics:
     """Finds joint positions that bring a tool point to a pose.
 
     Each iteration solves the damped least-squares problem
-    `min |W (J dq - e)|^2 + damping^2 |dq|^2`, where `e` holds the position error and
-    the orientation error. Joints that the step would push over a limit are frozen
-    there and the rest is solved again. What freedom is left pulls the joints towards
-    `posture`.
+    ``min |W (J dq - e)|^2 + damping^2 |dq|^2``, where ``e`` contains the position error
+    and the orientation error. Joints that the step would push over a limit are frozen
+    there and the rest is solved again. The remaining freedom pulls the joints towards
+    ``posture``.
 
     The solver works on its own copy of the simulation data and never changes the
     robot that it plans for.
 
     Args:
-        model: the `mujoco.MjModel`.
-        site: name of the site that carries the tool.
-        joints: names of the joints that may move, each with one degree of freedom.
+        model (mujoco.MjModel): the model.
+        site (str): name of the site that carries the tool.
+        joints (sequence of str): names of the joints that may move, each with one
+            degree of freedom.
 
     Keyword Args:
-        offset: the tool point in the site's frame, `[3]`, metres.
-        limits: lower and upper joint limits `[J, 2]`; the model's own where None.
-        damping: damping of the least-squares step.
-        rotation_weight: weight of one radian of orientation error against one metre.
-        iterations: iterations of one solve.
-        posture_gain: share of the way to `posture` that an iteration takes in the
-            null space.
-        max_step: largest change of a joint in one iteration, radians.
+        offset (ArrayLike): the tool point in the site's frame, ``[3]``, metres.
+            Defaults to zeros.
+        limits (ArrayLike, optional): lower and upper joint limits ``[J, 2]``. Defaults
+            to those of the model.
+        damping (float): damping of the least-squares step. Defaults to 0.03.
+        rotation_weight (float): weight of one radian of orientation error relative to
+            one metre. Defaults to 0.3.
+        iterations (int): iterations of one solve. Defaults to 8.
+        posture_gain (float): fraction of the distance to ``posture`` that an iteration
+            covers in the null space. Defaults to 0.1.
+        max_step (float): largest change of a joint in one iteration, radians.
+            Defaults to 0.3.
 
     Raises:
         ValueError: unknown site or joint, joints with several degrees of freedom,
             limits of the wrong shape.
 
-    Example:
+    Examples:
         >>> import mujoco, numpy as np
         >>> model = mujoco.MjModel.from_xml_string('''
         ... <mujoco><worldbody><body><joint name="a" axis="0 0 1"/>
@@ -165,15 +197,15 @@ class InverseKinematics:
             self.limits = np.array(limits, dtype=np.float64)
         if self.limits.shape != (len(ids), 2):
             raise ValueError(
-                f"limits have shape {self.limits.shape}, wanted {(len(ids), 2)}: one "
+                f"limits have shape {self.limits.shape}, expected {(len(ids), 2)}: one "
                 "(lower, upper) row per joint"
             )
-        # Bodies that the joints carry: children follow their parents in the model.
+        # Bodies that the joints move: children follow their parents in the model.
         self._moved = np.zeros(model.nbody, dtype=bool)
         self._moved[model.jnt_bodyid[ids]] = True
         for body in range(1, model.nbody):
             self._moved[body] |= self._moved[model.body_parentid[body]]
-        # With its base, which the arm is always close to.
+        # The whole robot, with its base, which the arm is always close to.
         self._robot = np.isin(model.body_rootid, model.body_rootid[self._moved])
         self._margins: dict[float, Any] = {}
         self.damping = damping
@@ -191,13 +223,14 @@ class InverseKinematics:
         return index
 
     def pose(self, qpos: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where the tool is in a configuration.
+        """Returns the pose of the tool in a configuration.
 
         Args:
-            qpos: positions of the whole model, `[nq]`.
+            qpos (ArrayLike): positions of the whole model, ``[nq]``.
 
         Returns:
-            the tool point `[3]` in metres and the site's rotation matrix `[3, 3]`.
+            tuple of numpy.ndarray: the tool point ``[3]`` in metres and the site's
+            rotation matrix ``[3, 3]``.
         """
         self.data.qpos[:] = qpos
         self._mujoco.mj_kinematics(self.model, self.data)
@@ -214,28 +247,32 @@ class InverseKinematics:
         posture: ArrayLike | None = None,
         iterations: int | None = None,
     ) -> IKSolution:
-        """Move the joints so that the tool comes to a pose.
+        """Finds joint positions that move the tool to a pose.
 
         Args:
-            qpos: positions of the whole model `[nq]` to start from; everything but
-                the solver's joints stays as it is.
-            position: target of the tool point, `[3]`, metres, world frame.
-            rotation: target rotation matrix `[3, 3]` of the site; free where None.
+            qpos (ArrayLike): positions ``[nq]`` of the whole model to start from;
+                everything but the solver's joints stays unchanged.
+            position (ArrayLike): target of the tool point, ``[3]``, metres, world
+                frame.
+            rotation (ArrayLike, optional): target rotation matrix ``[3, 3]`` of the
+                site. Defaults to ``None``: free.
 
         Keyword Args:
-            posture: joint positions `[J]` that the null space is pulled towards.
-            iterations: iterations of this call; the solver's own where None.
+            posture (ArrayLike, optional): joint positions ``[J]`` that the null space
+                is pulled towards.
+            iterations (int, optional): iterations of this call. Defaults to the
+                solver's own.
 
         Returns:
-            the joints and what error is left.
+            IKSolution: the joints and the remaining error.
 
         Raises:
-            ValueError: non-finite target.
+            ValueError: the target is not finite.
         """
         target = np.asarray(position, dtype=np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
             raise ValueError(
-                f"position is {target.tolist()}, wanted three finite numbers"
+                f"position is {target.tolist()}, expected three finite numbers"
             )
         orientation = None if rotation is None else np.asarray(rotation, np.float64)
         pull = None if posture is None else np.asarray(posture, dtype=np.float64)
@@ -260,7 +297,7 @@ class InverseKinematics:
         target: NDArray[np.float64],
         orientation: NDArray[np.float64] | None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the weighted error `[3 or 6]` and its Jacobian `[3 or 6, J]`."""
+        """Returns the weighted error ``[3 or 6]`` and its Jacobian ``[3 or 6, J]``."""
         point, rotation = self.pose(configuration)
         self._mujoco.mj_comPos(self.model, self.data)
         self._mujoco.mj_jac(
@@ -291,7 +328,7 @@ class InverseKinematics:
         jacobian: NDArray[np.float64],
         posture: NDArray[np.float64] | None,
     ) -> NDArray[np.float64]:
-        """Return the change of the joints `[J]`, limits respected."""
+        """Returns the change of the joints ``[J]`` within the limits."""
         low, high = self.limits.T
         free = np.ones(joints.size, dtype=bool)
         step = np.zeros(joints.size)
@@ -326,25 +363,28 @@ class InverseKinematics:
         iterations: int = 60,
         tolerance: float = 5e-3,
     ) -> NDArray[np.float64]:
-        """Search a configuration that reaches a pose without touching anything.
+        """Searches a configuration that reaches a pose without touching anything.
 
-        Starts from random joint positions, solves, and of the solutions free of
-        contacts takes the one with the least largest change from `near`.
+        Solves from random joint positions. Of the solutions without contacts, the one
+        whose largest change from ``near`` is smallest is returned.
 
         Args:
-            qpos: positions of the whole model, `[nq]`.
-            position: target of the tool point, `[3]`, metres.
-            rotation: target rotation matrix `[3, 3]`; free where None.
+            qpos (ArrayLike): positions of the whole model, ``[nq]``.
+            position (ArrayLike): target of the tool point, ``[3]``, metres.
+            rotation (ArrayLike, optional): target rotation matrix ``[3, 3]``. Defaults
+                to ``None``: free.
 
         Keyword Args:
-            near: joint positions `[J]` that the result should be close to.
-            rng: source of the random starts.
-            restarts: number of random starts.
-            iterations: iterations per start.
-            tolerance: largest position error of a solution, metres.
+            near (ArrayLike): joint positions ``[J]`` that the result should be close
+                to.
+            rng (numpy.random.Generator): generator of the random starts.
+            restarts (int): number of random starts. Defaults to 64.
+            iterations (int): iterations from each start. Defaults to 60.
+            tolerance (float): largest position error of a solution, metres.
+                Defaults to 0.005.
 
         Returns:
-            joint positions `[J]`.
+            numpy.ndarray: joint positions ``[J]``.
 
         Raises:
             RuntimeError: no start led to a collision-free solution.
@@ -389,22 +429,25 @@ class InverseKinematics:
         clearance: float = 0.02,
         spacing: float = 0.15,
     ) -> list[NDArray[np.float64]]:
-        """Choose a way through joint space: straight, or by one posture of several.
+        """Chooses a path in joint space: straight, or through one of several postures.
 
         Args:
-            qpos: positions of the whole model, `[nq]`, where the way begins.
-            target: joint positions `[J]` where it ends.
-            via: joint positions `[J]` each, by which it may go.
+            qpos (ArrayLike): positions of the whole model, ``[nq]``, where the path
+                starts.
+            target (ArrayLike): joint positions ``[J]`` where it ends.
+            via (iterable of ArrayLike): joint positions ``[J]`` that it may pass
+                through.
 
         Keyword Args:
-            clearance: distance to keep from what is not the robot, metres.
-            spacing: largest change of a joint between two configurations that are
-                looked at, radians.
+            clearance (float): distance to keep from everything but the robot, metres.
+                Defaults to 0.02.
+            spacing (float): largest change of a joint between two configurations that
+                are checked, radians. Defaults to 0.15.
 
         Returns:
-            the postures to go to, one after the other, the last of them `target`: of
-            all ways the one with the fewest configurations that are too close, and
-            of those the shortest.
+            list of numpy.ndarray: the postures to go to in sequence, ``target`` last:
+            the path with the fewest configurations that are too close, and of those
+            the shortest.
         """
         configuration = np.array(qpos, dtype=np.float64)
         begin, end = configuration[self.qpos_index], np.asarray(target, np.float64)
@@ -429,17 +472,17 @@ class InverseKinematics:
         return best
 
     def in_collision(self, qpos: ArrayLike, clearance: float = 0.0) -> bool:
-        """Tell whether the solver's part of the robot touches something.
+        """Returns whether the solver's part of the robot touches something.
 
         Args:
-            qpos: positions of the whole model, `[nq]`.
-            clearance: distance to what is not the robot that counts as touching,
-                metres.
+            qpos (ArrayLike): positions of the whole model, ``[nq]``.
+            clearance (float): distance to anything but the robot that counts as
+                touching, metres. Defaults to 0.
 
         Returns:
-            True where a body that the solver's joints move penetrates another body,
-            one of the robot's own included, or is nearer than `clearance` to something
-            that is not the robot.
+            bool: whether a body that the solver's joints move penetrates another body,
+            the robot's own included, or is nearer than ``clearance`` to something that
+            is not the robot.
         """
         self.data.qpos[:] = qpos
         self._mujoco.mj_kinematics(self.model, self.data)
@@ -450,7 +493,7 @@ class InverseKinematics:
         return bool((self._moved[bodies].any(axis=1) & (contact.dist < near)).any())
 
     def _with_margin(self, clearance: float) -> Any:
-        """Return a model whose contacts begin at that distance."""
+        """Returns a model whose contacts begin at that distance."""
         if clearance == 0:
             return self.model
         if clearance not in self._margins:
