@@ -11,6 +11,7 @@ from gymnasium_robotics.envs.franka_kitchen.kitchen_env import (
 )
 
 from torchrl_caiac.envs.kitchen import KITCHEN_TASKS, KitchenEnv, set_kitchen_start
+from torchrl_caiac.envs.kitchen.tasks import BURNER_RATIO, LIGHT_RATIO
 
 
 def test_default_is_upstreams(env):
@@ -62,9 +63,9 @@ def test_random_starts(env, task):
     for name in env.layout.names[1:]:
         own = starts[moved[name]][:, list(env.layout.columns[name])]
         if name.endswith("burner"):
-            assert np.allclose(own[:, 0] / 174, own[:, 1])
+            assert np.allclose(own[:, 0] / BURNER_RATIO, own[:, 1])
         elif name == "light_switch":
-            assert np.allclose(own[:, 0] / 14, own[:, 1])
+            assert np.allclose(own[:, 0] / LIGHT_RATIO, own[:, 1])
     # the kettle stands upright on the hob
     kettle = starts[:, 23:30]
     assert np.array_equal(kettle[:, 2:], np.tile(default[25:], (60, 1)))
@@ -124,6 +125,36 @@ def test_random_start_arguments(env):
         env.start_state("random")
 
 
+def test_couplings_are_those_of_the_model(env):
+    model = env.model
+    ratios = {
+        model.joint(first).name: coefficients[1]
+        for first, coefficients in zip(model.eq_obj1id, model.eq_data, strict=True)
+    }
+    knobs = {f"knob_Joint_{number}": BURNER_RATIO for number in (1, 2, 3, 4)}
+    assert ratios == {**knobs, "light_switch": LIGHT_RATIO}
+
+
+@pytest.mark.parametrize("way", ["open", "set_kitchen_start"])
+@pytest.mark.parametrize(
+    ("entity", "joint"),
+    [("light_switch", "light_switch"), ("bottom_burner", "knob_Joint_2")],
+)
+def test_coupled_joints_do_not_jump(env, franka_kitchen, way, entity, joint):
+    env.reset(seed=0, options={"open": entity})
+    data, step = env.data, env.step
+    if way == "set_kitchen_start":
+        franka_kitchen.reset(seed=0)
+        set_kitchen_start(
+            franka_kitchen, {joint: env.qpos[env.layout.columns[entity][0]]}
+        )
+        data, step = franka_kitchen.unwrapped.robot_env.data, franka_kitchen.step
+    columns = list(env.layout.columns[entity])
+    before = data.qpos[columns].copy()
+    step(np.zeros(9))
+    assert np.abs(data.qpos[columns] - before).max() < 1e-4
+
+
 def test_set_kitchen_start(franka_kitchen):
     franka_kitchen.reset(seed=0)
     for _ in range(3):
@@ -135,7 +166,7 @@ def test_set_kitchen_start(franka_kitchen):
     data = franka_kitchen.unwrapped.robot_env.data
     assert data.qpos[11] == -0.87
     assert data.qpos[12] == pytest.approx(-0.005)
-    assert data.qpos[18] == pytest.approx(-0.05)
+    assert data.qpos[18] == -0.69 / LIGHT_RATIO
     assert (data.qvel == 0).all()
     np.testing.assert_allclose(
         franka_kitchen.unwrapped.robot_env._last_robot_qpos, data.qpos[:9], atol=2e-3

@@ -13,6 +13,7 @@ from torchrl_caiac.envs.kitchen.tasks import (
     BURNER_RATIO,
     KITCHEN_LAYOUT,
     KITCHEN_TASKS,
+    LIGHT_RATIO,
     OBJECTS,
     TASK_COLUMNS,
     TASK_GOALS,
@@ -326,7 +327,7 @@ def set_kitchen_start(
         if name.startswith("knob_Joint_"):
             start[model.joint(name).qposadr[0] + 1] = position / BURNER_RATIO
         elif name == "light_switch":
-            start[model.joint("light_joint").qposadr[0]] = position * 0.05 / 0.69
+            start[model.joint("light_joint").qposadr[0]] = position / LIGHT_RATIO
     for name, value in (("qpos", start), ("qvel", speeds)):
         if not np.isfinite(value).all():
             raise ValueError(
