@@ -27,36 +27,6 @@ def solve(env: KitchenEnv, task: str) -> None:
     env.set_simulator(state)
 
 
-class TestHandles:
-    def test_a_handle_moves_with_its_object(self, env):
-        names = env.layout.names
-        assert tuple(env.handles) == names
-        states = np.stack([env.default_state()] * len(KITCHEN_TASKS))
-        for state, task in zip(states, KITCHEN_TASKS, strict=True):
-            state[list(env.layout.columns[task])] = env.solved(task)
-        moved = np.linalg.norm(
-            env.handle_positions(states) - env.handle_positions(env.default_state()),
-            axis=-1,
-        )
-        for i, task in enumerate(KITCHEN_TASKS):
-            others = [n for n, name in enumerate(names) if name != task]
-            assert moved[i, others].max() < 1e-9
-            # A knob turns around its own site.
-            turns = "burner" in task
-            assert (moved[i, names.index(task)] < 1e-3) == turns
-
-    def test_the_episode_goes_on(self, env):
-        env.reset(seed=0)
-        before = env.get_state().physics
-        env.handle_positions(np.zeros((2, 30)))
-        assert np.array_equal(env.get_state().physics, before)
-
-    @pytest.mark.parametrize("function", ["handle_positions", "render_states"])
-    def test_other_shapes_are_refused(self, env, function):
-        with pytest.raises(ValueError, match=r"shape \(1, 29\), expected \[S, 30\]"):
-            getattr(env, function)(np.zeros(29))
-
-
 class TestSpaces:
     def test_observation_and_goal(self, env):
         observation, info = env.reset(seed=0)
@@ -184,12 +154,6 @@ class TestDynamics:
         env.robot_env._last_robot_qpos = noise.last_robot_qpos.copy()
         again = env.step(np.zeros(9))[0]["observation"]
         assert np.abs(again[9:] - after[9:]).max() < 3e-4
-
-    def test_model_is_its_own(self):
-        first, second = KitchenEnv(), KitchenEnv()
-        first.model.opt.timestep = 0.1
-        assert second.model.opt.timestep == 0.002
-        assert KitchenEnv().model.opt.timestep == 0.002
 
 
 class TestGoalsAndSuccess:

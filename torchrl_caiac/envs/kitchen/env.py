@@ -26,6 +26,7 @@ from torchrl_caiac.envs.kitchen.tasks import (
     OBJECTS,
     STATE_COLUMNS,
     SUCCESS_DISTANCE,
+    check_task,
     done_tasks,
     kitchen_distances,
     kitchen_reward,
@@ -117,8 +118,6 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
     }
     #: The entities of the state and their goal columns.
     layout: ClassVar[EntityLayout] = KITCHEN_LAYOUT
-    #: The tasks, see :data:`KITCHEN_TASKS`.
-    tasks: ClassVar[tuple[str, ...]] = KITCHEN_TASKS
     #: Sites of the model where the robot touches and where each object is touched.
     handles: ClassVar[dict[str, str]] = HANDLES
     default_state = staticmethod(default_state)
@@ -163,7 +162,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         self._renderer: OffscreenRenderer | None = None
         self._truth: KitchenTruth | None = None
 
-        self._task_option = None if task is None else starts.check_task(task)
+        self._task_option = None if task is None else check_task(task)
         self._start_option = start
         self._open_option = starts.as_names(open)
         self._goal_option = goal
@@ -310,7 +309,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         self.task = (
             str(self.np_random.choice(KITCHEN_TASKS))
             if task is None
-            else starts.check_task(task)
+            else check_task(task)
         )
         self._start = self.start_state(
             options.get("start", self._start_option),

@@ -12,11 +12,11 @@ from torchrl_caiac.envs.kitchen.simulator import default_state
 from torchrl_caiac.envs.kitchen.tasks import (
     BURNER_RATIO,
     KITCHEN_LAYOUT,
-    KITCHEN_TASKS,
     LIGHT_RATIO,
     OBJECTS,
     TASK_COLUMNS,
     TASK_GOALS,
+    check_task,
     solved,
 )
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "as_names",
-    "check_task",
     "episode_goal",
     "random_start",
     "set_kitchen_start",
@@ -56,27 +55,6 @@ def as_names(value: str | Iterable[str]) -> tuple[str, ...]:
         (('kettle',), ('kettle', 'microwave'))
     """
     return (value,) if isinstance(value, str) else tuple(value)
-
-
-def check_task(task: str) -> str:
-    """Returns a task's name, or raises an error.
-
-    Args:
-        task (str): the name.
-
-    Returns:
-        str: the name.
-
-    Raises:
-        ValueError: there is no such task.
-
-    Examples:
-        >>> check_task("kettle")
-        'kettle'
-    """
-    if task not in KITCHEN_TASKS:
-        raise ValueError(f"task is {task!r}, expected one of {KITCHEN_TASKS}")
-    return task
 
 
 def start_state(

@@ -26,6 +26,7 @@ __all__ = [
     "SUCCESS_DISTANCE",
     "TASK_COLUMNS",
     "TASK_GOALS",
+    "check_task",
     "done_tasks",
     "kitchen_distances",
     "kitchen_reward",
@@ -107,6 +108,27 @@ _SOLVED: dict[str, NDArray[np.float64]] = {
     "top_right_burner": np.array([-0.92, -0.92 / BURNER_RATIO]),
     "light_switch": np.array([-0.69, -0.69 / LIGHT_RATIO]),
 }
+
+
+def check_task(task: str) -> str:
+    """Returns a task's name, or raises an error.
+
+    Args:
+        task (str): the name.
+
+    Returns:
+        str: the name.
+
+    Raises:
+        ValueError: there is no such task.
+
+    Examples:
+        >>> check_task("kettle")
+        'kettle'
+    """
+    if task not in KITCHEN_TASKS:
+        raise ValueError(f"task is {task!r}, expected one of {KITCHEN_TASKS}")
+    return task
 
 
 def task_number(name: str | None) -> int:
