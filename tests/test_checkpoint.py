@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import os
+import pickle
 import random
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tensordict
 import torch
-from torchrl.checkpoint import Checkpoint
+from tensordict import TensorDict
+from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 
@@ -18,7 +22,7 @@ from torchrl_caiac.checkpoint import TrainingCheckpoint
 class Run:
     """A training that draws from all three generators."""
 
-    def __init__(self, path: Path, seed: int) -> None:
+    def __init__(self, path: Path, seed: int, **kwargs) -> None:
         torch.manual_seed(seed)
         np.random.seed(seed)
         random.seed(seed)
@@ -32,6 +36,7 @@ class Run:
             model=self.model,
             optimizer=self.optimizer,
             scheduler=self.scheduler,
+            **kwargs,
         )
 
     def step(self) -> None:
@@ -45,9 +50,20 @@ class Run:
     def parameters(self) -> list[torch.Tensor]:
         return [value.clone() for value in self.model.state_dict().values()]
 
+    def everything(self) -> str:
+        """All that a checkpoint may change, as a text to compare."""
+        parts = (self.model, self.optimizer, self.scheduler)
+        states = [copy.deepcopy(part.state_dict()) for part in parts]
+        generators = (
+            torch.get_rng_state().tolist(),
+            np.random.get_state()[1].tolist(),
+            random.getstate(),
+        )
+        return repr((states, generators))
+
 
 class TestTrainingCheckpoint:
-    def test_goes_on_as_if_never_stopped(self, tmp_path):
+    def test_resumes_as_if_never_interrupted(self, tmp_path):
         path = tmp_path / "run" / "checkpoint.zip"
         run = Run(path, seed=1)
         assert run.checkpoint.load() == 0
@@ -56,7 +72,7 @@ class TestTrainingCheckpoint:
             if step == 3:
                 run.checkpoint.save(step)
         kept = path.read_bytes()
-        for _ in range(2):  # going on must not write into the file
+        for _ in range(2):  # a resumed run must not write into the file
             other = Run(path, seed=2)
             assert other.checkpoint.load() == 3
             for _ in range(3, 7):
@@ -96,6 +112,84 @@ class TestTrainingCheckpoint:
         assert run.checkpoint.load() == 2
         assert list(tmp_path.iterdir()) == [path]
 
+    def test_leftovers_of_interrupted_writes_are_removed(self, tmp_path):
+        run = Run(tmp_path / "checkpoint.zip", seed=1)
+        run.checkpoint.save(1)
+        (tmp_path / ".partial-12-checkpoint.zip").write_text("half")
+        (tmp_path / "..partial-12-checkpoint.zip.archive-0f").write_text("half")
+        (tmp_path / "..partial-12-checkpoint.zip.stage-0f").mkdir()
+        (tmp_path / "..partial-12-checkpoint.zip.stage-0f" / "x").write_text("half")
+        others = {".partial-12-other-checkpoint.zip", "a.partial-12-checkpoint.zip"}
+        for name in others:
+            (tmp_path / name).touch()
+        assert run.checkpoint.load() == 1
+        assert {p.name for p in tmp_path.iterdir()} == {"checkpoint.zip", *others}
+
+    def test_without_generators(self, tmp_path):
+        run = Run(tmp_path / "checkpoint.zip", seed=1, rng=False)
+        run.checkpoint.save(1)
+        torch.manual_seed(5)
+        state = torch.get_rng_state()
+        assert run.checkpoint.load() == 1
+        assert torch.equal(torch.get_rng_state(), state)
+        with pytest.raises(ValueError, match=r"expected the parts .*'rng'.*, got"):
+            Run(tmp_path / "checkpoint.zip", seed=1).checkpoint.load()
+
+    def test_settings_are_compared_first(self, tmp_path):
+        path = tmp_path / "checkpoint.zip"
+        settings = {"lr": 0.1, "model": {"sizes": (3, 4), "depth": 2}, "old": None}
+        run = Run(path, seed=1, settings=settings)
+        run.step()
+        run.checkpoint.save(5)
+        same = {**settings, "model": {"sizes": [3, 4], "depth": 2}}
+        assert Run(path, seed=2, settings=same).checkpoint.load() == 5
+        content = path.read_bytes()
+        other = {"lr": 0.2, "model": {"sizes": [3], "depth": 2}, "new": 1}
+        run = Run(path, seed=2, settings=other)
+        before = run.everything()
+        with pytest.raises(ValueError) as error:
+            run.checkpoint.load()
+        assert str(path) in str(error.value)
+        assert (
+            "other settings (lr: saved 0.1, given 0.2; model.sizes: saved [3, 4], "
+            "given [3]; new is new; old is missing): repeat"
+        ) in str(error.value)
+        assert run.everything() == before and path.read_bytes() == content
+
+    def test_more_steps_than_requested(self, tmp_path):
+        run = Run(tmp_path / "checkpoint.zip", seed=1)
+        run.checkpoint.save(5)
+        run.step()
+        before = run.everything()
+        with pytest.raises(ValueError, match=r"\.zip has 5 steps.*requested 4"):
+            run.checkpoint.load(max_step=4)
+        assert run.everything() == before
+        assert run.checkpoint.load(max_step=5) == 5
+
+    @pytest.mark.parametrize("part", ["model", "optimizer", "scheduler"])
+    def test_a_part_that_refuses_its_state_changes_nothing(
+        self, part, tmp_path, monkeypatch
+    ):
+        path = tmp_path / "checkpoint.zip"
+        saved = Run(path, seed=1)
+        saved.step()
+        saved.checkpoint.save(1)
+        run = Run(path, seed=2)
+        kind = type(getattr(run, part))
+        load_state_dict, calls = kind.load_state_dict, []
+
+        def refuse(self, state):
+            load_state_dict(self, state)
+            calls.append(state)
+            if len(calls) == 1:
+                raise RuntimeError("other sizes")
+
+        before = run.everything()
+        monkeypatch.setattr(kind, "load_state_dict", refuse)
+        with pytest.raises(ValueError, match=r"not a readable checkpoint.*other sizes"):
+            run.checkpoint.load()
+        assert len(calls) == 2 and run.everything() == before
+
     @pytest.mark.parametrize(
         "spoil",
         [
@@ -114,15 +208,22 @@ class TestTrainingCheckpoint:
         ],
         ids=["empty", "text", "truncated", "torch", "archive", "parts", "sizes"],
     )
-    def test_what_is_no_checkpoint_of_it(self, spoil, tmp_path):
+    def test_what_is_not_a_checkpoint_of_the_run(self, spoil, tmp_path):
         path = tmp_path / "checkpoint.zip"
         run = Run(path, seed=1)
         run.checkpoint.save(5)
         spoil(path)
-        content = path.read_bytes()
-        with pytest.raises(ValueError, match=r"(?s)no readable checkpoint.*delete it"):
+        content, before = path.read_bytes(), run.everything()
+        message = r"(?s)checkpoint\.zip is not a readable checkpoint.*delete it"
+        with pytest.raises(ValueError, match=message):
             run.checkpoint.load()
-        assert path.read_bytes() == content
+        assert path.read_bytes() == content and run.everything() == before
+
+    def test_a_folder_is_not_a_checkpoint(self, tmp_path):
+        run = Run(tmp_path / "folder", seed=1)
+        Checkpoint(model=run.model).save(tmp_path / "folder")
+        with pytest.raises(ValueError, match=r"not a readable checkpoint.*no file"):
+            run.checkpoint.load()
 
     def test_flipped_bytes_are_noticed(self, tmp_path):
         path = tmp_path / "checkpoint.zip"
@@ -133,5 +234,73 @@ class TestTrainingCheckpoint:
             largest = max(archive.infolist(), key=lambda info: info.file_size)
         content[largest.header_offset + largest.file_size // 2] ^= 0xFF
         path.write_bytes(content)
-        with pytest.raises(ValueError, match="no readable checkpoint"):
+        with pytest.raises(ValueError, match="not a readable checkpoint"):
             run.checkpoint.load()
+
+
+class Malicious:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+def plain_pickle(state: Path, evil: Malicious) -> None:
+    (state / "state.pt").write_bytes(pickle.dumps(evil))
+
+
+def torch_file(state: Path, evil: Malicious) -> None:
+    torch.save({"weight": evil}, state / "state.pt")
+
+
+def memory_mapped(state: Path, evil: Malicious) -> None:
+    td = TensorDict({"weight": torch.ones(1)}, [])
+    td.set_non_tensor("evil", evil)
+    tensordict.save(td, state / "state")
+    (state / "state.pt").unlink()
+    (state / "state.json").write_text('{"kind": "dict", "items": []}')
+
+
+@pytest.mark.parametrize("plant", [plain_pickle, torch_file, memory_mapped])
+def test_loading_executes_no_code_from_the_file(plant, tmp_path, monkeypatch):
+    marker, path = tmp_path / "marker", tmp_path / "checkpoint.zip"
+    model = torch.nn.Linear(1, 1)
+    checkpoint = TrainingCheckpoint(path, model=model)
+    save = StateDictCheckpointAdapter.save
+
+    def planting(self, component, path, **kwargs):
+        save(self, component, path, **kwargs)
+        if component is model:
+            plant(path, Malicious(marker))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StateDictCheckpointAdapter, "save", planting)
+        checkpoint.save(1)
+    before = copy.deepcopy(model.state_dict())
+    with pytest.raises(ValueError, match="not a readable checkpoint"):
+        checkpoint.load()
+    assert not marker.exists()
+    assert all(map(torch.equal, model.state_dict().values(), before.values()))
+    # The payload is live: it runs where pickles are trusted.
+    theirs = Checkpoint(format="archive").register("model", torch.nn.Linear(1, 1))
+    with pytest.raises(RuntimeError):
+        theirs.load(path, tensor_load_kwargs={"weights_only": False})
+    assert marker.is_dir()
+
+
+def test_a_file_cannot_choose_another_adapter(tmp_path):
+    path, other = tmp_path / "checkpoint.zip", tmp_path / "other.zip"
+    checkpoint = TrainingCheckpoint(path, model=torch.nn.Linear(1, 1))
+    checkpoint.save(1)
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(other, "w") as target:
+        for info in source.infolist():
+            content = source.read(info)
+            if info.filename == "manifest.json":
+                content = content.replace(b"torchrl.state_dict", b"torchrl.dump_load")
+            target.writestr(info, content)
+    os.replace(other, path)
+    with pytest.raises(ValueError, match=r"manifest adapter is 'torchrl\.dump_load'"):
+        checkpoint.load()

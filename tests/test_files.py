@@ -9,7 +9,13 @@ import stat
 import pytest
 from omegaconf import OmegaConf
 
-from torchrl_caiac._files import claim_folder, whole_file, whole_folder, write_json
+from torchrl_caiac._files import (
+    claim_folder,
+    remove_leftovers,
+    whole_file,
+    whole_folder,
+    write_json,
+)
 
 
 class TestWholeFile:
@@ -36,6 +42,17 @@ class TestWholeFile:
             pass  # nothing is written
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
+
+    def test_leftovers_of_interrupted_writes_are_removed(self, tmp_path):
+        path = tmp_path / "table.txt"
+        remove_leftovers(tmp_path / "missing" / "table.txt")
+        writes = [whole_file(tmp_path / name) for name in ("table.txt", "other.txt")]
+        for write in writes:
+            write.__enter__().write_text("half")  # and never leaves
+        assert len(list(tmp_path.iterdir())) == 2
+        remove_leftovers(path)
+        (left,) = tmp_path.iterdir()
+        assert left.name.endswith("other.txt")
 
 
 class TestWriteJson:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +14,14 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-__all__ = ["claim_folder", "plain", "whole_file", "whole_folder", "write_json"]
+__all__ = [
+    "claim_folder",
+    "plain",
+    "remove_leftovers",
+    "whole_file",
+    "whole_folder",
+    "write_json",
+]
 
 _PARTIAL = ".partial-"
 
@@ -48,6 +56,37 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def remove_leftovers(path: str | os.PathLike[str]) -> None:
+    """Removes what interrupted calls of :func:`whole_file` have left next to a file.
+
+    That is their partial files, and the temporary files and folders that others made
+    with the name of a partial file and a suffix. No other process may be writing the
+    file.
+
+    Args:
+        path (path): the file.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import remove_leftovers
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(f"{folder}/.partial-7-table.txt").write_text("4")
+        ...     remove_leftovers(f"{folder}/table.txt")
+        ...     os.listdir(folder)
+        []
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        return
+    pattern = rf"\.?{re.escape(_PARTIAL)}\d+-{re.escape(path.name)}(\.\w+-\w+)?"
+    for left in path.parent.iterdir():
+        if re.fullmatch(pattern, left.name):
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -1,29 +1,49 @@
-"""Checkpoints from which an interrupted run resumes."""
+"""Checkpoints from which an interrupted training run resumes."""
 
 from __future__ import annotations
 
+import copy
+import json
 import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torchrl.checkpoint import Checkpoint, GlobalRNGState, StateDictCheckpointAdapter
 
-from torchrl_caiac._files import whole_file
+from torchrl_caiac._files import plain, remove_leftovers, whole_file
 
 __all__ = ["TrainingCheckpoint"]
 
+_CONTENT = "torchrl_caiac.checkpoint/1"
+_ADVICE = "delete it to start from scratch, or give another path"
+
 
 class TrainingCheckpoint:
-    """Where a training run goes on after it was killed, in one file.
+    """Saves the state of a training run in one file, and restores it.
 
-    Holds the state of every part, and of the global random number generators of torch,
-    NumPy and Python. Loaded without pickle; replaced atomically.
+    The file contains the state of every part, the number of steps, the settings of the
+    run and, by default, the state of the global random number generators of torch,
+    NumPy and Python. It is a TorchRL checkpoint
+    (:class:`~torchrl.checkpoint.Checkpoint`) in the archive format.
+
+    - A file is written atomically: an interrupted write leaves the old file as it was.
+    - A file is refused as a whole: when :meth:`load` raises, no part has changed.
+    - Loading executes no code from the file: only tensors and plain containers are
+      read.
+
+    One process at a time may use a path.
 
     Args:
-        path (path): the file, ``checkpoint.zip`` say.
+        path (path): the file, such as ``"checkpoint.zip"``.
 
     Keyword Args:
-        parts (Any): what has ``state_dict`` and ``load_state_dict``: models,
+        settings (Mapping, optional): what the run depends on, JSON-compatible. A file
+            with other settings is refused.
+        rng (bool): whether to save the global random number generators too. Defaults
+            to ``True``.
+        **parts (Any): objects with ``state_dict`` and ``load_state_dict``: models,
             optimizers, schedulers.
 
     Examples:
@@ -32,47 +52,144 @@ class TrainingCheckpoint:
         >>> from torchrl_caiac.checkpoint import TrainingCheckpoint
         >>> model = torch.nn.Linear(2, 1)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     checkpoint = TrainingCheckpoint(f"{folder}/checkpoint.zip", model=model)
+        ...     checkpoint = TrainingCheckpoint(
+        ...         f"{folder}/checkpoint.zip", settings={"lr": 0.1}, model=model
+        ...     )
         ...     before = checkpoint.load()
         ...     checkpoint.save(step=10)
         ...     before, checkpoint.load()
         (0, 10)
     """
 
-    def __init__(self, path: str | os.PathLike[str], **parts: Any) -> None:
-        self.path = Path(path)
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        settings: Mapping[str, Any] | None = None,
+        rng: bool = True,
+        **parts: Any,
+    ) -> None:
+        self.path = Path(path).expanduser().absolute()
+        # Through JSON, so that tuples equal lists.
+        self._settings = json.loads(json.dumps(plain(settings or {})))
+        self._parts = {**parts, "rng": GlobalRNGState()} if rng else parts
         self._checkpoint = Checkpoint(format="archive")
-        for name, part in {**parts, "rng": GlobalRNGState()}.items():
-            # As tensordicts optimizers would get views of the file, and write into it.
-            adapter = StateDictCheckpointAdapter(payload_format="torch")
-            self._checkpoint.register(name, part, adapter=adapter)
+        for name, part in self._parts.items():
+            self._checkpoint.register(name, part, adapter=_TensorsOnly("torch"))
 
     def save(self, step: int) -> None:
         """Writes the file.
 
         Args:
-            step (int): gradient steps that were taken.
+            step (int): the number of steps taken so far.
         """
+        metadata = {"content": _CONTENT, "step": step, "settings": self._settings}
         # TorchRL moves an old file away before it puts the new one in its place.
         with whole_file(self.path) as partial:
-            self._checkpoint.save(partial, metadata={"step": step})
+            self._checkpoint.save(partial, metadata=metadata)
 
-    def load(self) -> int:
-        """Restores all parts, where there is a file.
+    def load(self, *, max_step: int | None = None) -> int:
+        """Restores all parts if the file exists.
+
+        It also removes what interrupted writes of the file have left.
+
+        Keyword Args:
+            max_step (int, optional): the number of steps that are requested in total.
 
         Returns:
-            int: the steps that were taken, 0 without a file.
+            int: the number of steps taken, 0 if there is no file.
 
         Raises:
-            ValueError: the file is truncated, or of something else.
+            ValueError: the file is truncated or not a checkpoint of this run, its
+                settings differ, or it has more than ``max_step`` steps.
         """
+        remove_leftovers(self.path)
         if not self.path.exists():
             return 0
         try:
-            loaded = self._checkpoint.load(self.path)
-            return int(loaded.manifest["metadata"]["step"])
+            step, settings = self._read_manifest()
         except Exception as error:
+            raise self._unreadable(error) from error
+        differences = list(_differences(settings, self._settings))
+        if differences:
             raise ValueError(
-                f"{self.path} is no readable checkpoint of this training, it may be "
-                f"truncated or foreign ({error}): delete it to begin anew"
-            ) from error
+                f"the checkpoint {self.path} was made with other settings "
+                f"({'; '.join(differences)}): repeat the run with the saved settings, "
+                f"or {_ADVICE}"
+            )
+        if max_step is not None and step > max_step:
+            raise ValueError(
+                f"the checkpoint {self.path} has {step} steps, more than the requested "
+                f"{max_step}: request more steps, or {_ADVICE}"
+            )
+        try:
+            # On the CPU: each part moves its state to its own device.
+            loaded = self._checkpoint.load(self.path, map_location="cpu")
+            self._restore(loaded.values)
+        except Exception as error:
+            raise self._unreadable(error) from error
+        return step
+
+    def _read_manifest(self) -> tuple[int, dict[str, Any]]:
+        """The steps and the settings of the file, once its parts are the expected."""
+        if not self.path.is_file():
+            raise ValueError("it is no file")
+        manifest = Checkpoint.manifest(self.path)
+        metadata, parts = manifest["metadata"], sorted(manifest["components"])
+        if metadata.get("content") != _CONTENT:
+            raise ValueError(
+                f"expected the content {_CONTENT!r}, got {metadata.get('content')!r}"
+            )
+        if parts != sorted(self._parts):
+            raise ValueError(f"expected the parts {sorted(self._parts)}, got {parts}")
+        return int(metadata["step"]), dict(metadata["settings"])
+
+    def _restore(self, states: Mapping[str, Any]) -> None:
+        """Restores all parts, or none."""
+        before = {
+            name: copy.deepcopy(p.state_dict()) for name, p in self._parts.items()
+        }
+        try:
+            for name, part in self._parts.items():
+                part.load_state_dict(states[name])
+        except BaseException:
+            for name, part in self._parts.items():
+                part.load_state_dict(before[name])
+            raise
+
+    def _unreadable(self, error: Exception) -> ValueError:
+        return ValueError(
+            f"{self.path} is not a readable checkpoint of this run, it may be "
+            f"truncated ({error}): {_ADVICE}"
+        )
+
+
+class _TensorsOnly(StateDictCheckpointAdapter):
+    """Reads a state dict that was saved in the ``"torch"`` format, and nothing else.
+
+    TorchRL's own adapter takes the format from the file. A file could thereby choose a
+    memory-mapped tensordict, whose non-tensor entries are unpickled.
+    """
+
+    def load(self, component: Any, path: Path, **kwargs: Any) -> Any:
+        """Returns the state; the caller loads it once all states have been read."""
+        return torch.load(
+            path / self.state_torch,
+            map_location=kwargs["map_location"],
+            weights_only=True,
+        )
+
+
+def _differences(saved: Any, given: Any, name: str = "") -> Iterator[str]:
+    """Describes every setting that differs, by its dotted name."""
+    if isinstance(saved, dict) and isinstance(given, dict):
+        for key in dict.fromkeys([*given, *saved]):
+            inner = f"{name}.{key}" if name else key
+            if key not in saved:
+                yield f"{inner} is new"
+            elif key not in given:
+                yield f"{inner} is missing"
+            else:
+                yield from _differences(saved[key], given[key], inner)
+    elif saved != given:
+        yield f"{name}: saved {saved!r}, given {given!r}"

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
-import shutil
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,21 +12,19 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
-from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
+from tensordict.utils import NestedKey
 from tqdm.auto import tqdm
 
-from torchrl_caiac.modules.entity_dynamics_model import (
-    EntityDynamicsModel,
-    with_class,
-)
+from torchrl_caiac._keys import as_key, get_leaf, jsonable
+from torchrl_caiac.checkpoint import TrainingCheckpoint
+from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
+from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = ["fit_world_model"]
 
 _LOGGER = logging.getLogger("torchrl_caiac.fit")
-_FORMAT = "torchrl_caiac.fit_world_model/1"
-_CHUNK = 65_536  # rows read at once from the data
-_EVAL_ROWS = 4_096  # rows through the network at once in validation
+_CHUNK = 65_536  # rows read from the data at once
+_EVAL_ROWS = 4_096  # rows that pass the network at once in validation
 
 
 def fit_world_model(
@@ -52,53 +47,59 @@ def fit_world_model(
 ) -> TensorDict:
     """Fits a world model by maximum likelihood (paper, A.7).
 
-    Adam on the loss of :class:`EntityDynamicsLoss`, batches drawn with replacement.
-    Whole trajectories are held out for validation, and the model ends with the weights
-    and statistics of the step that had the least negative log likelihood there, in
-    evaluation mode. The scale of the targets is taken from the training trajectories,
-    unless the model has one already.
+    It minimises the loss of :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` with
+    Adam, on batches drawn with replacement. Whole trajectories are held out for
+    validation. The model ends in evaluation mode, with the weights and statistics of
+    the step with the lowest negative log likelihood on the validation data. The scale
+    of the targets comes from the training trajectories, unless the model has one
+    already.
 
-    With ``checkpoint``, the same call made again goes on where the last one stopped
-    (killed or finished) and ends with the same weights, bit for bit, as one that was
-    never interrupted; a larger ``steps`` goes on further.
+    With ``checkpoint``, an interrupted call resumes where it stopped when it is
+    repeated, and ends with the same weights, bit for bit, as an uninterrupted one. A
+    call with more ``steps`` continues a finished one.
 
     Args:
         model (EntityDynamicsModel): the model, changed in place.
-        data (TensorDictBase or sequence of it): transitions ``[T]``, in memory or
-            memmap. Trajectories of several data sets are told apart.
+        data (TensorDictBase or sequence of TensorDictBase): transitions ``[T]``, in
+            memory or memory-mapped. The transitions of a trajectory are stored one
+            after another. Trajectories of different data sets are distinct.
 
     Keyword Args:
-        steps (int): gradient steps in total. Defaults to 100 000.
-        batch_size (int): rows a step. Defaults to 500.
-        lr (float): learning rate. Defaults to 8e-4.
-        validation_fraction (float): the share of the trajectories that is held out, at
-            least one. Defaults to 0.1.
-        trajectory_key (NestedKey): the number of each row's trajectory, integers
-            ``[T]``. Defaults to ``"episode"``.
-        eval_every (int): steps between two validations. Defaults to 1 000.
-        max_validation_rows (int): validate on a fixed random choice of so many rows
-            where more are held out. Defaults to 100 000.
-        checkpoint (path, optional): a file to keep the state in, replaced atomically.
-        checkpoint_every (int): steps between two checkpoints. Defaults to 5 000.
-        seed (int): of the split and the batches. Defaults to 0.
-        max_memory (int): bytes up to which the needed columns are copied to one block
-            of memory; beyond, each batch reads the data. Defaults to 1 GiB.
-        flush_denormal (bool): treat denormal numbers as zero meanwhile, which can
-            halve a step's time on a CPU. Defaults to ``True``.
-        progress (bool): show a progress bar. Defaults to ``True``.
+        steps (int): the number of gradient steps in total. Defaults to ``100_000``.
+        batch_size (int): transitions in each step. Defaults to ``500``.
+        lr (float): the learning rate. Defaults to ``8e-4``.
+        validation_fraction (float): the fraction of the trajectories to hold out, at
+            least one trajectory. Defaults to ``0.1``.
+        trajectory_key (NestedKey): the trajectory ids, integers ``[T]`` or ``[T, 1]``.
+            Defaults to ``"episode"``.
+        eval_every (int): the number of steps between two validations. Defaults to
+            ``1_000``.
+        max_validation_rows (int): the number of held-out transitions to validate on;
+            if more are held out, a fixed random choice. Defaults to ``100_000``.
+        checkpoint (path, optional): the file for a
+            :class:`~torchrl_caiac.checkpoint.TrainingCheckpoint`.
+        checkpoint_every (int): the number of steps between two checkpoints. Defaults
+            to ``5_000``.
+        seed (int): the seed of the split and of the batches. Defaults to ``0``.
+        max_memory (int): the size in bytes up to which the columns that the model
+            reads are copied to one block of memory. Larger data are read batch by
+            batch. Defaults to ``2**30`` (1 GiB).
+        flush_denormal (bool): whether to treat denormal numbers as zero during the
+            call, which can halve the time of a step on a CPU. Defaults to ``True``.
+        progress (bool): whether to show a progress bar. Defaults to ``True``.
 
     Returns:
-        TensorDict: one row per validation, ``[E]``: ``"step"``; ``"train_nll"``, the
-        mean over the steps since the last one; ``"validation_nll"``; ``"best"``, true
-        where the validation was the best so far (the last such row is the model's);
+        TensorDict: one row for each validation, ``[E]``: ``"step"``; ``"train_nll"``,
+        the mean over the steps since the last one; ``"validation_nll"``; ``"best"``,
+        true if the validation was the best so far (the last such row is the model's);
         and ``("validation_mse", <entity>)``, in squared physical units.
 
     Raises:
         KeyError: a key is missing in the data.
-        ValueError: an argument is out of range; the data are empty, hold NaN or
-            infinities, do not fit the model, or have fewer than two trajectories; the
-            checkpoint is truncated, foreign, or of other settings or data.
-        RuntimeError: the loss is no longer finite.
+        ValueError: an argument is out of range; the data are empty, contain NaN or
+            infinite values, do not fit the model, or have fewer than two trajectories;
+            the checkpoint is truncated, or was made with other settings or data.
+        RuntimeError: the loss is not finite.
 
     Examples:
         >>> import torch
@@ -136,44 +137,45 @@ def fit_world_model(
         raise ValueError(f"lr must be positive and finite, got {lr!r}")
     if not 0 < validation_fraction < 1:
         raise ValueError(
-            f"validation_fraction must lie between 0 and 1, got {validation_fraction!r}"
+            f"validation_fraction must be between 0 and 1, got {validation_fraction!r}"
         )
     sources = [data] if isinstance(data, TensorDictBase) else list(data)
     rows = _Rows(model, sources, max_memory)
     generator = torch.Generator().manual_seed(seed)
+    key = as_key(trajectory_key)
     train, validation = _split(
-        _trajectories(sources, unravel_key(trajectory_key)),
+        _trajectory_numbers(sources, key),
         validation_fraction,
         max_validation_rows,
         generator,
     )
-    settings = {
-        "model": model.config,
-        "rows": rows.lengths,
-        "checksum": rows.checksum,
-        "batch_size": batch_size,
-        "lr": lr,
-        "validation_fraction": validation_fraction,
-        "trajectory_key": str(unravel_key(trajectory_key)),
-        "eval_every": eval_every,
-        "max_validation_rows": max_validation_rows,
-        "seed": seed,
-    }
-    fit = _Fit(model, lr, generator, settings)
-    path = None if checkpoint is None else Path(checkpoint).expanduser().absolute()
-    if path is not None:
-        _clean(path)
-    if path is not None and path.exists():
-        fit.load(path)
-        if fit.step > steps:
-            raise ValueError(
-                f"the checkpoint {path} has {fit.step} steps already, more than "
-                f"steps={steps}: raise steps, or give another path"
-            )
-        _LOGGER.info("going on at step %d of %s", fit.step, path)
-    elif not model.fitted:
+    fit = _Fit(model, lr, generator)
+    keeper: TrainingCheckpoint | None = None
+    if checkpoint is not None:
+        keeper = TrainingCheckpoint(
+            checkpoint,
+            settings={
+                "model": model.config,
+                "data_rows": rows.lengths,
+                "data_checksum": rows.checksum,
+                "batch_size": batch_size,
+                "lr": lr,
+                "validation_fraction": validation_fraction,
+                "trajectory_key": jsonable(key),
+                "eval_every": eval_every,
+                "max_validation_rows": max_validation_rows,
+                "seed": seed,
+            },
+            rng=False,  # the batches come from a generator of their own
+            model=model,
+            optimizer=fit.optimizer,
+            fit=fit,
+        )
+        fit.step = keeper.load(max_step=steps)
+        if fit.step:
+            _LOGGER.info("resuming at step %d of %s", fit.step, keeper.path)
+    if not model.fitted:
         model.fit_statistics(rows.raw_targets(train))
-    saved = fit.step if path is not None and path.exists() else -1
 
     model.train()
     bar = tqdm(
@@ -202,11 +204,10 @@ def fit_world_model(
                     nll=f"{fit.history[-1]['validation_nll']:.3f}",
                     best=f"{fit.best_nll:.3f}",
                 )
-            if path is not None and fit.step % checkpoint_every == 0:
-                fit.save(path)
-                saved = fit.step
-    if path is not None and saved != fit.step:
-        fit.save(path)
+            if keeper is not None and (
+                fit.step % checkpoint_every == 0 or fit.step == steps
+            ):
+                keeper.save(fit.step)
     model.load_state_dict(fit.best)
     model.eval()
     return fit.table()
@@ -225,13 +226,13 @@ class _Rows:
         for td in sources:
             if td.batch_dims != 1:
                 raise ValueError(
-                    f"the data have the batch size {list(td.batch_size)}, wanted flat "
-                    "rows [T]: use td.reshape(-1)"
+                    f"the data have the batch size {list(td.batch_size)}, expected "
+                    "flat transitions [T]: use td.reshape(-1)"
                 )
         self.lengths = [len(td) for td in sources]
         total = sum(self.lengths)
         if not total:
-            raise ValueError("the data have no row: collect or load some first")
+            raise ValueError("the data are empty: collect or load transitions first")
         self.starts = torch.tensor([0, *self.lengths]).cumsum(0)
         self.sizes = [model.state_dim, model.action_dim, model.predict_dim]
         width = sum(self.sizes)
@@ -253,12 +254,12 @@ class _Rows:
         for td in self.sources:
             for start in range(0, len(td), _CHUNK):
                 part = td[start : start + _CHUNK]
-                action = part.get(model.action_key, None)
-                if action is None:
-                    raise KeyError(
-                        f"the data lack the action {model.action_key!r}, they have "
-                        f"{sorted(map(str, part.keys(include_nested=True)))}"
-                    )
+                action = get_leaf(
+                    part,
+                    model.action_key,
+                    "the data lack the action",
+                    "name its leaf with the model's action_key",
+                )
                 state = model.layout.read(part)
                 after = model.layout.read(part, next=True)
                 for what, x, size in (
@@ -268,9 +269,9 @@ class _Rows:
                 ):
                     if tuple(x.shape) != (len(part), size):
                         raise ValueError(
-                            f"{what} have the shape {list(x.shape)}, but the model "
-                            f"reads {[len(part), size]}: give the data that the "
-                            "model's layout describes"
+                            f"{what} have the shape {list(x.shape)}, expected "
+                            f"{[len(part), size]}: give the data that the model's "
+                            "layout describes"
                         )
                 model.check_finite(state, first_row=first)
                 model.check_finite(after, next=True, first_row=first)
@@ -290,7 +291,7 @@ class _Rows:
         return torch.cat([state.float(), action.float(), raw.float()], 1)
 
     def get(self, index: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """States, actions and raw targets of some rows, on the model's device."""
+        """Returns states, actions and raw targets of rows, on the model's device."""
         if self.block is not None:
             return self.block[index.to(self.device)].split(self.sizes, 1)
         model, layout = self.model, self.model.layout
@@ -308,26 +309,21 @@ class _Rows:
         return out.to(self.device).split(self.sizes, 1)
 
     def raw_targets(self, index: torch.Tensor) -> Iterator[torch.Tensor]:
-        """The raw targets of some rows, in chunks."""
+        """Yields the raw targets of rows, in chunks."""
         for part in index.split(_CHUNK):
             yield self.get(part)[2]
 
 
 class _Fit:
-    """Everything that a fit is resumed from."""
+    """The state of a fit next to its model and its optimizer."""
 
     def __init__(
-        self,
-        model: EntityDynamicsModel,
-        lr: float,
-        generator: torch.Generator,
-        settings: dict[str, Any],
+        self, model: EntityDynamicsModel, lr: float, generator: torch.Generator
     ) -> None:
         self.model = model
         fused = model.device.type in ("cpu", "cuda")
         self.optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=fused)
         self.generator = generator
-        self.settings = settings
         self.step = 0
         self.best: dict[str, Any] = {}
         self.best_nll = math.inf
@@ -337,7 +333,7 @@ class _Fit:
 
     @torch.no_grad()
     def validate(self, rows: _Rows, index: torch.Tensor) -> None:
-        """Adds a row to the history, and keeps the model if it is the best."""
+        """Adds a row to the history, and keeps the model's state if it is the best."""
         model = self.model
         model.eval()
         nll = torch.zeros((), dtype=torch.float64)
@@ -373,7 +369,7 @@ class _Fit:
         self.train_count = 0
 
     def table(self) -> TensorDict:
-        """The history as a tensordict ``[E]``."""
+        """Returns the history as a tensordict ``[E]``."""
 
         def column(name: str, dtype: torch.dtype = torch.float64) -> torch.Tensor:
             return torch.tensor([row[name] for row in self.history], dtype=dtype)
@@ -391,101 +387,23 @@ class _Fit:
             [len(self.history)],
         )
 
-    def save(self, path: Path) -> None:
-        """Writes a checkpoint, which replaces the old one when it is whole."""
-        holder = _Holder(
-            {
-                "format": _FORMAT,
-                "settings": json.dumps(self.settings),
-                "step": self.step,
-                "model": self.model.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "generator": self.generator.get_state(),
-                "best": self.best,
-                "best_nll": self.best_nll,
-                "history": self.history,
-                "train_sum": self.train_sum,
-                "train_count": self.train_count,
-            }
-        )
-        partial = _partial(path)
-        try:
-            _checkpoint(holder).save(partial, metadata={"content": _FORMAT})
-            os.replace(partial, path)
-        except BaseException:
-            _clean(path)
-            raise
-
-    def load(self, path: Path) -> None:
-        """Restores a checkpoint; when it is refused, nothing has changed."""
-        holder = _Holder({})
-        advice = "delete it to begin anew, or give another path"
-        try:
-            _checkpoint(holder).load(path, map_location="cpu")
-            saved = holder.content
-            found = saved["format"]
-        except Exception as error:
-            raise ValueError(
-                f"{path} is no readable checkpoint of fit_world_model, it may be "
-                f"truncated or foreign ({error}): {advice}"
-            ) from error
-        if found != _FORMAT:
-            raise ValueError(
-                f"the checkpoint {path} is of the format {found!r}, wanted "
-                f"{_FORMAT!r}: {advice}"
-            )
-        settings = json.loads(saved["settings"])
-        settings["model"] = with_class(settings["model"])
-        wanted = json.loads(json.dumps(self.settings))
-        for name, value in wanted.items():
-            if settings.get(name) != value:
-                raise ValueError(
-                    f"the checkpoint {path} was made with another {name}, saved "
-                    f"{settings.get(name)!r}, now {value!r}: repeat the call as it "
-                    f"was, or {advice}"
-                )
-        self.model.load_state_dict(saved["model"])
-        self.optimizer.load_state_dict(saved["optimizer"])
-        self.generator.set_state(saved["generator"])
-        self.best = saved["best"]
-        self.train_sum.copy_(saved["train_sum"])
-        for name in ("step", "best_nll", "history", "train_count"):
-            setattr(self, name, saved[name])
-
-
-class _Holder:
-    """Hands a dictionary to and from a TorchRL checkpoint, as one component."""
-
-    def __init__(self, content: dict[str, Any]) -> None:
-        self.content = content
-
     def state_dict(self) -> dict[str, Any]:
-        return self.content
+        """Returns what a checkpoint saves."""
+        return {
+            "generator": self.generator.get_state(),
+            "best": self.best,
+            "best_nll": self.best_nll,
+            "history": self.history,
+            "train_sum": self.train_sum,
+            "train_count": self.train_count,
+        }
 
-    def load_state_dict(self, content: dict[str, Any]) -> None:
-        self.content = content
-
-
-def _checkpoint(holder: _Holder) -> Checkpoint:
-    # The tensordicts' own format would give the optimizer views of the file.
-    return Checkpoint(format="archive").register(
-        "fit", holder, adapter=StateDictCheckpointAdapter(payload_format="torch")
-    )
-
-
-def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.name}.partial")
-
-
-def _clean(path: Path) -> None:
-    """Removes what a killed process left beside a checkpoint."""
-    partial = _partial(path)
-    if path.parent.is_dir():
-        for left in [partial, *path.parent.glob(f".{partial.name}.*-*")]:
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                left.unlink(missing_ok=True)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.generator.set_state(state["generator"])
+        self.train_sum.copy_(state["train_sum"])
+        for name in ("best", "best_nll", "history", "train_count"):
+            setattr(self, name, state[name])
 
 
 def _copy(state: dict[str, Any]) -> dict[str, Any]:
@@ -495,27 +413,27 @@ def _copy(state: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _trajectories(sources: Sequence[TensorDictBase], key: NestedKey) -> torch.Tensor:
-    """A number for each row ``[T]``, equal within a trajectory only."""
+def _trajectory_numbers(
+    sources: Sequence[TensorDictBase], key: NestedKey
+) -> torch.Tensor:
+    """Returns the number of each row's trajectory, int64 ``[T]``."""
     parts: list[torch.Tensor] = []
     offset = 0
     for td in sources:
-        ids = td.get(key, None)
-        if ids is None:
-            raise KeyError(
-                f"the data lack the trajectory key {key!r}, they have "
-                f"{sorted(map(str, td.keys(include_nested=True)))}: the validation "
-                "data are whole trajectories, name the key that tells them apart"
-            )
-        if ids.numel() != len(td) or ids.is_floating_point():
-            raise ValueError(
-                f"{key!r} is {ids.dtype} of the shape {list(ids.shape)}, wanted one "
-                f"integer for each of the {len(td)} rows"
-            )
-        _, number = torch.unique(ids.reshape(-1).cpu(), return_inverse=True)
-        parts.append(number + offset)
-        if len(number):
-            offset += int(number.max()) + 1
+        if not len(td):
+            continue
+        ids = get_leaf(
+            td,
+            key,
+            "the data lack the trajectory key",
+            "name the leaf that has the trajectory ids, so that whole trajectories can "
+            "be held out for validation",
+        )
+        if ids.is_floating_point():
+            raise ValueError(f"{key!r} is {ids.dtype}, expected integers")
+        numbers = trajectory_index(td, trajectory_key=key, done_key=None).numbers()
+        parts.append(numbers.cpu() + offset)
+        offset = int(parts[-1][-1]) + 1
     return torch.cat(parts)
 
 
@@ -525,12 +443,12 @@ def _split(
     max_validation_rows: int,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The row numbers for training and for validation, by whole trajectories."""
+    """Returns the rows for training and for validation, in whole trajectories."""
     count = int(trajectory.max()) + 1
     if count < 2:
         raise ValueError(
-            "the data hold a single trajectory, and validation needs one of its own: "
-            "collect more, or correct trajectory_key"
+            "the data contain a single trajectory, expected at least two, one of them "
+            "for validation: collect more, or correct trajectory_key"
         )
     held_out = min(max(1, round(fraction * count)), count - 1)
     validates = torch.zeros(count, dtype=torch.bool)
@@ -545,8 +463,8 @@ def _split(
 
 @contextmanager
 def _flushing_denormals(wanted: bool) -> Iterator[None]:
-    """Treats denormal numbers as zero, and then restores the process' setting."""
-    # torch has no getter; a denormal that survives an addition tells.
+    """Treats denormal numbers as zero in the block, if wanted."""
+    # torch has no getter for the current setting: add two denormal numbers instead.
     denormal = torch.tensor([1e-310], dtype=torch.float64)
     already = not bool((denormal + denormal).any())
     changed = wanted and not already and torch.set_flush_denormal(True)
