@@ -120,7 +120,7 @@ def train(cfg: DictConfig, arm: Arm, seed: int) -> LMPModel:
         (model.observation_norm, data["observation"]),
         (model.goal_norm, goals),
     ):
-        norm.std[values.std(0) < settings.resting] = torch.inf
+        norm.ignore(values.std(0) < settings.resting)
     loss_module = LMPLoss(
         model,
         kl_weight=settings.kl_weight,

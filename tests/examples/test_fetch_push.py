@@ -207,7 +207,11 @@ def test_truncated_files_are_refused(content, cfg, steps):
     path = train.run_folder(cfg, "none", 7) / "checkpoint.zip"
     policy = train.policy_file(cfg, "none", 7, 12)
     for file, act, message in (
-        (path, lambda: train.train(cfg, "none", 7), r"checkpoint\.zip is not a readable"),
+        (
+            path,
+            lambda: train.train(cfg, "none", 7),
+            r"checkpoint\.zip is not a readable",
+        ),
         (policy, lambda: train.load_policy(cfg, "none", 7, 12), "no readable policy"),
     ):
         whole = file.read_bytes()

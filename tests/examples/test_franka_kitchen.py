@@ -149,7 +149,7 @@ def test_a_truncated_checkpoint_is_refused(content, cfg, steps):
     path = train.run_folder(cfg, "none", 7) / "checkpoint.zip"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2] if content is None else content)
-    with pytest.raises(ValueError, match=r"checkpoint\.zip is not a readable checkpoint"):
+    with pytest.raises(ValueError, match=r"\.zip is not a readable checkpoint"):
         train.train(cfg, "none", seed=7)
     path.write_bytes(whole)
     train.train(cfg, "none", seed=7)

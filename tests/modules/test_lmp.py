@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_caiac.modules import lmp
-from torchrl_caiac.modules.lmp import LMPModel, Standardize, gaussian_plan
+from torchrl_caiac.modules import running_norm
+from torchrl_caiac.modules.lmp import LMPModel
+from torchrl_caiac.modules.lmp_parts import gaussian_plan
 
 D, G, A, K, P = 5, 2, 3, 6, 4
 
@@ -150,7 +151,7 @@ def make_rows(n: int = 50) -> TensorDict:
 @pytest.mark.parametrize("memmap", [False, True])
 @pytest.mark.parametrize("chunk", [7, 65_536])
 def test_statistics_against_torch(memmap, chunk, monkeypatch, tmp_path):
-    monkeypatch.setattr(lmp, "_ROWS_PER_CHUNK", chunk)
+    monkeypatch.setattr(running_norm, "_ROWS_PER_CHUNK", chunk)
     rows = make_rows()
     rows["observation"][:, 0] = 3.0  # never moves: the floor holds
     rows["action"][:, 0] = 0.25
@@ -164,10 +165,12 @@ def test_statistics_against_torch(memmap, chunk, monkeypatch, tmp_path):
         (model.action_norm, "action", 0.05),
     ):
         std = want[key].std(0, unbiased=False).clamp_min(floor)
-        torch.testing.assert_close(norm.mean, want[key].mean(0).float())
-        torch.testing.assert_close(norm.std, std.float())
-    assert model.observation_norm.std[0] == pytest.approx(0.02)
-    assert model.action_norm.std[0] == pytest.approx(0.05)
+        torch.testing.assert_close(norm.mean, want[key].mean(0))
+        torch.testing.assert_close(norm.scale, std)
+        normalised = (want[key] - want[key].mean(0)) / std
+        torch.testing.assert_close(norm(want[key]), normalised.float())
+    assert model.observation_norm.scale[0] == pytest.approx(0.02)
+    assert model.action_norm.scale[0] == pytest.approx(0.05)
 
 
 def test_statistics_take_windows_masks_and_goals():
@@ -180,8 +183,8 @@ def test_statistics_take_windows_masks_and_goals():
     windows["observation"][:, -1] = float("nan")
     model = make_model().fit_statistics(windows, goals=goals)
     valid = windows["observation"][mask]
-    torch.testing.assert_close(model.observation_norm.mean, valid.mean(0))
-    torch.testing.assert_close(model.goal_norm.mean, goals.mean(0))
+    torch.testing.assert_close(model.observation_norm.mean, valid.double().mean(0))
+    torch.testing.assert_close(model.goal_norm.mean, goals.double().mean(0))
 
 
 def test_statistics_are_shared_and_saved():
@@ -190,9 +193,9 @@ def test_statistics_are_shared_and_saved():
         assert part.module.observation_norm is model.observation_norm
     other = LMPModel(**model.config)
     other.load_state_dict(model.state_dict())
-    torch.testing.assert_close(other.goal_norm.std, model.goal_norm.std)
+    torch.testing.assert_close(other.goal_norm.gain, model.goal_norm.gain)
     torch.testing.assert_close(
-        other.decoder.module.observation_norm.mean, model.observation_norm.mean
+        other.decoder.module.observation_norm.shift, model.observation_norm.shift
     )
     twin = copy.deepcopy(model)
     assert twin.prior.module.goal_norm is twin.goal_norm
@@ -201,9 +204,9 @@ def test_statistics_are_shared_and_saved():
 @pytest.mark.parametrize(
     ("key", "bad", "match"),
     [
-        ("observation", float("nan"), "'observation' holds 1 non-finite"),
-        ("action", float("inf"), "'action' holds 1 non-finite"),
-        ("desired_goal", float("nan"), "'desired_goal' holds 1 non-finite"),
+        ("observation", float("nan"), "'observation' has 1 non-finite"),
+        ("action", float("inf"), "'action' has 1 non-finite"),
+        ("desired_goal", float("nan"), "'desired_goal' has 1 non-finite"),
         ("action", 1.5, "'action' reaches 1.5.*rescale"),
     ],
 )
@@ -224,7 +227,7 @@ def test_statistics_of_nothing():
         model.fit_statistics(make_rows()[:0])
     with pytest.raises(KeyError, match="desired_goal"):
         model.fit_statistics(make_rows().exclude("desired_goal"))
-    with pytest.raises(ValueError, match="goals has shape"):
+    with pytest.raises(ValueError, match=r"goals has the shape \[4, 3\], expected"):
         model.fit_statistics(make_rows(), goals=torch.zeros(4, G + 1))
     rows = make_rows()
     rows["mask"] = torch.ones(50, 2, dtype=torch.bool)
@@ -238,7 +241,7 @@ def test_missing_and_misshapen_leaves():
     with pytest.raises(KeyError, match="desired_goal"):
         model(td)
     td["desired_goal"] = torch.randn(4, G + 1)
-    with pytest.raises(ValueError, match=r"'desired_goal' has shape \(4, 3\)"):
+    with pytest.raises(ValueError, match=r"'desired_goal' has the shape \[4, 3\]"):
         model(td)
 
 
@@ -271,9 +274,3 @@ def test_sizes_follow_the_design():
         assert len(linear) == layers
         assert all(m.out_features == 128 for m in linear[:3])
     assert model.decoder.in_keys == ["plan"]
-
-
-def test_standardize_casts_to_its_own_dtype():
-    norm = Standardize(2, 0.1)
-    assert norm(torch.zeros(3, 2, dtype=torch.float64)).dtype == torch.float32
-    assert norm.double()(torch.zeros(3, 2)).dtype == torch.float64

@@ -286,17 +286,17 @@ def test_bad_leaves():
         actor(make_rows(3).exclude("desired_goal"))
     rows = make_rows(3)
     rows["desired_goal"] = torch.zeros(3, G + 1)
-    with pytest.raises(ValueError, match=r"'desired_goal' has shape \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"'desired_goal' has the shape \[3, 3\]"):
         actor(rows)
     rows = TensorDict({**make_rows(3), "desired_goal": torch.zeros(G)})
     with pytest.raises(ValueError, match="must agree"):
         actor(rows)
     rows = TensorDict({**make_rows(3), "is_init": torch.ones(2, dtype=torch.bool)})
-    with pytest.raises(ValueError, match="'is_init' has shape"):
+    with pytest.raises(ValueError, match="'is_init' has the shape"):
         actor(rows)
     td = carry(actor(make_rows(3)))
     td["lmp", "actions"] = torch.zeros(3, K + 1, A)
-    with pytest.raises(ValueError, match="another model"):
+    with pytest.raises(ValueError, match="take the primer from this actor"):
         actor(td)
 
 

@@ -7,7 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_caiac.modules.running_norm import RunningNorm
+from torchrl_caiac.modules import running_norm as module
+from torchrl_caiac.modules.running_norm import RunningNorm, gather_statistics
 
 
 @settings(max_examples=40, deadline=None)
@@ -68,9 +69,97 @@ def test_constant_columns_become_zero(value: float) -> None:
 @pytest.mark.parametrize("shape", [(4,), (5, 4), (2, 3, 4), (0, 4)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_any_batch_shape_and_dtype(shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    norm = RunningNorm(4)
+    norm = RunningNorm(4).to(dtype)
     out = norm(torch.randn(shape, dtype=dtype))
     assert out.shape == shape and out.dtype == dtype and torch.isfinite(out).all()
+
+
+def test_the_result_has_the_dtype_of_the_layer() -> None:
+    norm = RunningNorm(2, floor=0.1, frozen=True)
+    assert norm.dtype == torch.float32
+    assert norm(torch.zeros(3, 2, dtype=torch.float64)).dtype == torch.float32
+    assert norm.double().dtype == torch.float64
+    assert norm(torch.zeros(3, 2)).dtype == torch.float64
+
+
+def test_frozen_statistics_change_by_update_only() -> None:
+    norm = RunningNorm(2, frozen=True)
+    x = torch.randn(50, 2) * 3 + 1
+    assert norm.training and torch.equal(norm(x), x) and norm.count == 0
+    norm.update(x)
+    y = norm(x + 5)
+    torch.testing.assert_close(y, (x + 5 - x.mean(0)) / x.std(0, correction=0))
+    assert norm.count == 50 and torch.equal(norm(x + 5), y)
+
+
+def test_no_deviation_is_below_the_floor() -> None:
+    x = torch.tensor([[1.0, 0.0, 7.0], [1.2, 4.0, 7.0]])
+    norm = RunningNorm(3, floor=0.5, frozen=True)
+    assert torch.equal(norm(x), x)  # until there are statistics
+    norm.update(x)
+    scale = torch.tensor([0.5, 2.0, 0.5]).double()
+    torch.testing.assert_close(norm.scale, scale)
+    want = (x - torch.tensor([1.1, 2.0, 7.0])) / scale.float()
+    torch.testing.assert_close(norm(x), want)
+    for floor in (-0.1, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match="floor must be finite and not negative"):
+            RunningNorm(3, floor=floor)
+
+
+def test_statistics_are_taken_over_under_the_own_floor() -> None:
+    gathered, norm = RunningNorm(2), RunningNorm(2, floor=0.5)
+    gathered.update(torch.tensor([[1.0, 0.0], [1.2, 4.0]]))
+    norm.update(torch.full((9, 2), 100.0))
+    norm.replace(gathered)
+    torch.testing.assert_close(norm.mean, gathered.mean)
+    assert norm.count == 2
+    torch.testing.assert_close(norm.scale, torch.tensor([0.5, 2.0]).double())
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.5])
+def test_ignored_features_are_zero(floor: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(20, 3, generator=generator)
+    norm, whole = (RunningNorm(3, floor=floor, frozen=True) for _ in range(2))
+    mask = torch.tensor([False, True, False])
+    norm.ignore(mask)
+    assert torch.equal(norm(x), x.masked_fill(mask, 0.0))
+    for layer in (norm, whole):
+        layer.update(x)
+    assert torch.equal(norm(x + 9), whole(x + 9).masked_fill(mask, 0.0))
+    twin = RunningNorm(3, floor=floor, frozen=True)
+    twin.load_state_dict(norm.state_dict())
+    assert torch.equal(twin(x), norm(x))
+    norm.replace(whole)
+    assert torch.equal(norm(x), whole(x))
+    for bad in (mask.float(), mask[:2]):
+        with pytest.raises(ValueError, match=r"expected a bool mask \[3\], got"):
+            norm.ignore(bad)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    rows=st.integers(1, 40),
+    chunk=st.integers(1, 50),
+    masked=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_gathered_statistics_do_not_depend_on_the_chunks(
+    rows: int, chunk: int, masked: bool, seed: int
+) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(rows, 2, generator=generator).double() * 3 + 7
+    mask = torch.rand(rows, generator=generator) < 0.5
+    mask[0] = True
+    valid = x[mask] if masked else x
+    if masked:
+        x = x.masked_fill(~mask[:, None], float("nan"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_ROWS_PER_CHUNK", chunk)
+        found = gather_statistics(x, "x", mask=mask if masked else None)
+    assert found.count == len(valid)
+    torch.testing.assert_close(found.mean, valid.mean(0))
+    torch.testing.assert_close(found.var, valid.var(0, correction=0))
 
 
 def test_no_parameters_and_state_dict_round_trip() -> None:

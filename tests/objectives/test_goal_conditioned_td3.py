@@ -354,7 +354,7 @@ def test_time_limits_do_not_cut_bootstrapping():
     torch.testing.assert_close(results[False, True], results[False, False])
     torch.testing.assert_close(results[True, False], reward)
     assert (results[False, True] != reward).all()
-    with pytest.raises(KeyError, match=r"terminated.*which the data lacks"):
+    with pytest.raises(KeyError, match=r"data lack .*terminated"):
         loss(data.exclude(("next", "terminated")))
     del data["next", "done"]
     torch.manual_seed(3)
@@ -716,9 +716,9 @@ def test_bad_arguments(kwargs, match):
 )
 def test_missing_leaves(key):
     loss = make_loss(bc_alpha=2.5, bc_mask_key=MASK)
-    with pytest.raises(KeyError, match="which the data lacks") as error:
+    with pytest.raises(KeyError, match="the data lack") as error:
         loss(make_batch(4).exclude(key))
-    assert f"{key!r} is read" in error.value.args[0]
+    assert f"lack {key!r}; they have" in error.value.args[0]
 
 
 def test_bad_leaves():
@@ -726,7 +726,7 @@ def test_bad_leaves():
     data = make_batch(4)
     data["desired_goal"] = torch.zeros(4, 7)
     for part in (loss.actor_loss, loss.value_loss):
-        with pytest.raises(ValueError, match=r"'desired_goal' has 7 columns.*has 2"):
+        with pytest.raises(ValueError, match=r"has 7 columns, expected 2"):
             part(data)
     for name in ("reward", "terminated"):
         data = make_batch(4)

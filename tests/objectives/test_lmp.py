@@ -182,7 +182,7 @@ def test_mask_of_all_true_changes_nothing():
 
 def test_shorter_windows_need_a_mask():
     batch = make_batch(4, window=K - 2)
-    with pytest.raises(ValueError, match=f"windows of {K - 2} steps.*built for {K}"):
+    with pytest.raises(ValueError, match=f"windows of {K - 2} steps, expected {K}"):
         make_loss()(batch)
     batch["mask"] = torch.ones(4, K - 2, dtype=torch.bool)
     assert make_loss()(batch)["loss_reconstruction"].isfinite()
@@ -280,11 +280,11 @@ def test_bad_leaves(key):
         loss(make_batch(4).exclude(key))
     batch = make_batch(4)
     batch[key] = torch.zeros(4, K, 11)
-    with pytest.raises(ValueError, match=rf"'{key}' has shape \(4, 6, 11\)"):
+    with pytest.raises(ValueError, match=rf"'{key}' has the shape \[4, 6, 11\]"):
         loss(batch)
     batch = make_batch(4)
     batch[key][1, 0, 1] = float("nan")
-    with pytest.raises(ValueError, match=f"'{key}' holds 1 non-finite"):
+    with pytest.raises(ValueError, match=f"'{key}' has 1 non-finite"):
         loss(batch)
 
 
@@ -304,7 +304,7 @@ def test_bad_shapes():
     ("mask", "match"),
     [
         (torch.ones(4, K), "float32"),
-        (torch.ones(4, K - 1, dtype=torch.bool), r"shape \(4, 5\)"),
+        (torch.ones(4, K - 1, dtype=torch.bool), r"shape \[4, 5\]"),
         (torch.arange(K).expand(4, K) != 2, "first steps"),
         (torch.arange(K).expand(4, K) > 2, "first steps"),
         (torch.zeros(4, K, dtype=torch.bool), "first steps"),

@@ -262,8 +262,7 @@ class GaussianWorldModel(EntityDynamicsModel):
                 torch.cat([self.loc_head.bias, self.var_head.bias]),
                 relu=False,
             )
-            shift = self.state_norm.mean.to(dtype)
-            scale = self.state_norm.scale.reciprocal().to(dtype)
+            shift, gain = self.state_norm.shift, self.state_norm.gain
             floor = self._variance_floor().to(dtype)
         num_actions = len(actions)
         states_at_once = max(1, rows // num_actions)
@@ -274,7 +273,7 @@ class GaussianWorldModel(EntityDynamicsModel):
                 raise ValueError(
                     f"states are [B, {self.state_dim}], got {list(state.shape)}"
                 )
-            state = (state.to(dtype) - shift) * scale
+            state = (state.to(dtype) - shift) * gain
             size = (len(state), num_actions, 2 * self.predict_dim)
             out = state.new_empty(size)
             for own_out, own in zip(

@@ -1,4 +1,4 @@
-"""What goal-conditioned networks read: states, goals and the way between them."""
+"""The input of goal-conditioned networks: states, goals and their differences."""
 
 from __future__ import annotations
 
@@ -7,20 +7,23 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 
 from torchrl_caiac._layout_reading import check_width
+from torchrl_caiac._keys import as_key, get_leaf
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.modules.lmp import Standardize, _moments
+from torchrl_caiac.modules.running_norm import RunningNorm, gather_statistics
 
 __all__ = ["GoalFeatures"]
 
 
-def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[torch.Tensor]:
-    """The leaves of some keys, all of which must be there.
+def read_leaves(
+    tensordict: TensorDictBase, keys: Sequence[NestedKey]
+) -> list[torch.Tensor]:
+    """Reads leaves, all of which must be present.
 
     Args:
-        tensordict (TensorDictBase): where to read.
+        tensordict (TensorDictBase): the data.
         keys (sequence of NestedKey): the leaves.
 
     Returns:
@@ -31,51 +34,48 @@ def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[torch.Te
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> read(TensorDict({"a": 1}), ["a"])
+        >>> from torchrl_caiac.modules.goal_features import read_leaves
+        >>> read_leaves(TensorDict({"a": 1}), ["a"])
         [tensor(1)]
     """
-    values = [tensordict.get(key, None) for key in keys]
-    for key, value in zip(keys, values, strict=True):
-        if value is None:
-            found = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(
-                f"{key!r} is read, which the data lacks: write it, or name the leaf "
-                f"that holds it; the data has {found}"
-            )
-    return values
+    remedy = "write it, or name the leaf that has it"
+    return [get_leaf(tensordict, key, "the data lack", remedy) for key in keys]
 
 
 class GoalFeatures(TensorDictModuleBase):
-    """Joins a state and a goal, and adds where the objects are to go.
+    """Joins a state and a goal, and adds where the objects have to go.
 
     The ``F`` features are, in this order, the ``W`` columns of all entities
-    (:meth:`EntityLayout.read`; columns that no entity owns are left out), the ``G``
-    columns of the desired goal and, if ``relative``, for each goal column what is
-    achieved minus the reference's position (if there is a reference) and the goal
-    minus what is achieved. The relative features are computed here, inside the
-    network, and so from the state that a swap has left: stored ones would still
-    describe the entity that was swapped out.
+    (:meth:`~torchrl_caiac.EntityLayout.read`; columns that no entity owns are left
+    out), the ``G`` columns of the desired goal and, if ``relative``, for each goal
+    column the achieved goal minus the position of the reference (if there is one), and
+    the desired goal minus the achieved one. The relative features are computed from
+    the state after a swap. Stored ones would still describe the entity that was
+    swapped out.
 
-    All features are standardized by fixed statistics that :meth:`fit_statistics`
-    takes from data; until then they pass unchanged. Fit them before networks are
-    made of the features, which copy them.
+    All features are normalised by fixed statistics, which :meth:`fit_statistics` takes
+    from data; until then they pass unchanged. Call it before networks are made of the
+    features: networks copy them.
 
     Args:
         layout (EntityLayout): a flat layout with ``goal`` and ``achieved`` columns.
 
     Keyword Args:
         relative (bool): whether to add the relative features. Defaults to ``True``.
-        reference (str, optional): the entity that the positions are taken relative to
-            (the gripper): its first columns, as many as an entity has goal columns.
-            ``None``, the default, leaves these features out.
-        floor (float): the smallest deviation to divide by, in the units of the data.
-            Defaults to 0.02.
+        reference (str, optional): the entity to take positions relative to, such as
+            the gripper. Its first columns are read, as many as an entity has goal
+            columns. Defaults to ``None``, which leaves these features out.
+        floor (float): the smallest standard deviation to divide by, in the units of
+            the data. Defaults to ``0.02``.
         out_key (NestedKey): where the features are written, ``[*B, F]``. Defaults to
             ``"features"``.
 
+    Attributes:
+        norm (RunningNorm): the normalisation of the features.
+
     Raises:
-        ValueError: the layout is nested or says nothing of goals, the reference does
-            not fit it, or the floor is not positive.
+        ValueError: the layout is nested or has no goals, the reference does not fit
+            it, or the floor is not positive.
 
     Examples:
         >>> import torch
@@ -111,8 +111,8 @@ class GoalFeatures(TensorDictModuleBase):
         super().__init__()
         if not layout.is_flat or not layout.achieved:
             raise ValueError(
-                "GoalFeatures needs a flat layout that says which observation columns "
-                "the goal mirrors: give EntityLayout(..., goal=..., achieved=...)"
+                "GoalFeatures needs a flat layout with the observation columns that "
+                "the goal describes: give EntityLayout(..., goal=..., achieved=...)"
             )
         if not 0.0 < floor < float("inf"):
             raise ValueError(f"floor must be positive and finite, got {floor!r}")
@@ -136,34 +136,34 @@ class GoalFeatures(TensorDictModuleBase):
         self._tensors: dict[tuple[str, torch.device], torch.Tensor] = {}
         blocks = 1 + relative + (reference is not None)
         self.width = self.state_dim + layout.goal_width * blocks
-        self.standardize = Standardize(self.width, floor)
+        self.norm = RunningNorm(self.width, floor=floor, frozen=True)
         assert layout.observation_key is not None
         assert layout.desired_goal_key is not None
         self.observation_key: NestedKey = layout.observation_key
         self.desired_goal_key: NestedKey = layout.desired_goal_key
         self.in_keys = [self.observation_key, self.desired_goal_key]
-        self.out_keys = [unravel_key(out_key)]
+        self.out_keys = [as_key(out_key)]
 
     @property
     def state_dim(self) -> int:
-        """The number ``W`` of the state's columns among the features."""
+        """The number ``W`` of the features that are columns of the state."""
         return len(self._columns["state"])
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the standardized features.
+        """Writes the normalised features.
 
         Args:
             tensordict (TensorDictBase): states ``[*B, D]`` and goals ``[*B, G]``.
 
         Returns:
-            TensorDictBase: the same, with the features ``[*B, F]`` set.
+            TensorDictBase: the same tensordict, with the features ``[*B, F]``.
 
         Raises:
             KeyError: the state or the goal is missing.
             ValueError: one of them has the wrong width.
         """
-        features = self.forward_tensors(*read(tensordict, self.in_keys))
+        features = self.forward_tensors(*read_leaves(tensordict, self.in_keys))
         return tensordict.set(self.out_keys[0], features)
 
     def forward_tensors(
@@ -172,14 +172,14 @@ class GoalFeatures(TensorDictModuleBase):
         goal: torch.Tensor,
         params: TensorDictBase | None = None,
     ) -> torch.Tensor:
-        """The standardized features of tensors.
+        """Returns the normalised features of tensors.
 
         Args:
             observation (torch.Tensor): ``[*B, D]``.
             goal (torch.Tensor): ``[*B, G]``.
-            params (TensorDictBase, optional): statistics to use instead of the
-                module's, such as those of ``C`` modules, stacked. ``*B`` begins with
-                ``C`` then.
+            params (TensorDictBase, optional): buffers to use instead of the module's
+                own. Those of ``C`` modules may be stacked; ``*B`` then begins with
+                ``C``. Defaults to the module's own.
 
         Returns:
             torch.Tensor: ``[*B, F]``, in the dtype of the statistics.
@@ -189,19 +189,20 @@ class GoalFeatures(TensorDictModuleBase):
         """
         features = self._join(observation, goal)
         if params is None:
-            return self.standardize(features)
-        mean, std = (params.get(("standardize", name)) for name in ("mean", "std"))
-        if mean.ndim > 1:
-            shape = (len(mean), *[1] * (features.ndim - 2), -1)
-            mean, std = mean.reshape(shape), std.reshape(shape)
-        return ((features - mean) / std).to(mean.dtype)
+            return self.norm(features)
+        shift, gain = (params.get(("norm", name)) for name in ("shift", "gain"))
+        if shift.ndim > 1:
+            shape = (len(shift), *[1] * (features.ndim - 2), -1)
+            shift, gain = shift.reshape(shape), gain.reshape(shape)
+        return ((features - shift) * gain).to(shift.dtype)
 
     def fit_statistics(self, tensordict: TensorDictBase) -> GoalFeatures:
-        """Takes mean and deviation of every feature from data, in float64.
+        """Takes the mean and the standard deviation of every feature from data.
 
         Args:
-            tensordict (TensorDictBase): rows ``[*B]`` with the goals that the networks
-                will see, such as a large sample of the relabelling replay buffer.
+            tensordict (TensorDictBase): transitions ``[*B]`` with the goals that the
+                networks will read, such as a large sample of the replay buffer that
+                relabels goals.
 
         Returns:
             GoalFeatures: the module itself.
@@ -229,14 +230,14 @@ class GoalFeatures(TensorDictModuleBase):
             tensor([[-1., 0., 1.],
                     [ 1., 0., -1.]])
         """
-        observation, goal = read(tensordict, self.in_keys)
+        observation, goal = read_leaves(tensordict, self.in_keys)
         for key, value in zip(self.in_keys, (observation, goal), strict=True):
             if not value.isfinite().all():
                 raise ValueError(
-                    f"{key!r} holds {int((~value.isfinite()).sum())} non-finite values "
+                    f"{key!r} has {int((~value.isfinite()).sum())} non-finite values "
                     f"in a batch of shape {list(value.shape)}: remove or repair them"
                 )
-        self.standardize.set(*_moments(self._join(observation, goal), "features", None))
+        self.norm.replace(gather_statistics(self._join(observation, goal), "features"))
         return self
 
     def _join(self, observation: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
@@ -244,8 +245,8 @@ class GoalFeatures(TensorDictModuleBase):
         check_width(layout, observation.shape[-1], self.observation_key)
         if goal.shape[-1] != layout.goal_width:
             raise ValueError(
-                f"{self.desired_goal_key!r} has {goal.shape[-1]} columns, but the "
-                f"layout's goal has {layout.goal_width}: correct `goal`, or the data"
+                f"{self.desired_goal_key!r} has {goal.shape[-1]} columns, expected "
+                f"{layout.goal_width}: correct the layout's goal, or the data"
             )
         whole = self._whole and observation.shape[-1] == self.state_dim
         parts = [observation if whole else self._pick(observation, "state"), goal]
@@ -257,7 +258,7 @@ class GoalFeatures(TensorDictModuleBase):
         return torch.cat(parts, -1)
 
     def _pick(self, observation: torch.Tensor, what: str) -> torch.Tensor:
-        # Kept per device and not as buffers, of which a loss makes one per critic.
+        # Cached for each device. As buffers, a loss would copy them for each critic.
         device = observation.device
         if (what, device) not in self._tensors:
             index = torch.tensor(self._columns[what], device=device)
@@ -268,7 +269,7 @@ class GoalFeatures(TensorDictModuleBase):
 def _by_goal_column(
     layout: EntityLayout, columns: dict[str, tuple[int, ...]]
 ) -> list[int]:
-    """The observation columns of all entities in the order of the goal's columns."""
+    """Returns the observation columns of all entities in the order of the goal's."""
     pairs = [
         pair
         for name, goal in layout.goal.items()
@@ -280,8 +281,8 @@ def _by_goal_column(
 def _reference_columns(layout: EntityLayout, reference: str) -> list[int]:
     if reference not in layout.names:
         raise ValueError(
-            f"reference names {reference!r}, which is no entity of this layout: it has "
-            f"{list(layout.names)}"
+            f"reference is {reference!r}, which is no entity of this layout: expected "
+            f"one of {list(layout.names)}"
         )
     position = layout.columns[reference]
     columns = {}

@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import nn
 from torchrl.modules import MLP
 
-from torchrl_caiac.modules.goal_features import GoalFeatures, read
+from torchrl_caiac.modules.goal_features import GoalFeatures, read_leaves
 from torchrl_caiac.modules.linear import linear
 
 __all__ = ["GoalConditionedActor", "GoalConditionedCritic"]
@@ -212,7 +212,7 @@ class GoalConditionedActor(TensorDictModuleBase):
             KeyError: an input is missing.
             ValueError: the state or the goal has the wrong width.
         """
-        observation, goal = read(tensordict, self.in_keys)
+        observation, goal = read_leaves(tensordict, self.in_keys)
         low, span, of_features, of_network = (
             (self.low, self.span, None, None)
             if params is None
@@ -302,7 +302,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
             KeyError: an input is missing.
             ValueError: the state or the goal has the wrong width.
         """
-        observation, goal, action = read(tensordict, self.in_keys)
+        observation, goal, action = read_leaves(tensordict, self.in_keys)
         of_features, of_network = (
             None if params is None else params.get(name)
             for name in ("features", "network")

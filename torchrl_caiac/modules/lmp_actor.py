@@ -1,22 +1,19 @@
-"""A policy that plays Latent Motor Plans in (batched) environments."""
+"""The policy of Latent Motor Plans for (batched) environments."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
+from torchrl_caiac._keys import join
 from torchrl_caiac._random import draw_numbers
-from torchrl_caiac.modules.lmp import (
-    LMPModel,
-    gaussian_plan,
-    plan_is_sampled,
-    read_leaf,
-)
+from torchrl_caiac.modules.lmp import LMPModel, read_leaf
+from torchrl_caiac.modules.lmp_parts import gaussian_plan, plan_is_sampled
 
 __all__ = ["LMPActor"]
 
@@ -24,42 +21,46 @@ __all__ = ["LMPActor"]
 class LMPActor(TensorDictModuleBase):
     """Draws a plan from the prior every κ steps and plays its actions.
 
-    A window starts in a row (environment) where κ actions have been played since
-    the last start, or where ``"is_init"`` is True. There a plan is drawn from
-    p(z | s, g). The open-loop decoder turns it into κ actions at once, played one a
-    step; the closed-loop decoder gives an action for the plan and every new state.
-    Every row counts on its own: one environment may reset in the middle of its
-    window while the others play on.
+    A window starts in an environment (a row of the batch) when κ actions have been
+    played since the last start, or when ``"is_init"`` is true. A plan is then drawn
+    from p(z | s, g). The open-loop decoder turns it into κ actions at once, one for
+    each step; the closed-loop decoder gives an action for the plan and each new state.
+    Environments are independent: one may reset in the middle of its window while the
+    others continue theirs.
 
-    Plan, actions and step counter live in the tensordict, as the hidden states of
-    TorchRL's recurrent modules do: they are read at the root, written under
-    ``"next"``, and carried on by the environment. It has to know these leaves:
-    append :meth:`make_tensordict_primer` to it, and ``InitTracker`` for
-    ``"is_init"``.
-
-    The plan is sampled (as in the paper), unless ``sample`` is False; an
-    exploration type that is set takes precedence, ``ExplorationType.RANDOM``
-    samples, any other plays the plan's mean.
+    Plan, actions and step counter are carried in the tensordict, as the hidden states
+    of TorchRL's recurrent modules are: the actor reads them at the root and writes them
+    under ``"next"``, and the environment steps them. The environment has to know these
+    leaves: append :meth:`make_tensordict_primer` to it, and
+    :class:`~torchrl.envs.InitTracker` for ``"is_init"``.
 
     Args:
-        model: prior and decoder.
+        model (LMPModel): the model with prior and decoder.
 
     Keyword Args:
-        sample: whether plans are drawn where no exploration type is set.
-        generator: source of the plans' noise, of any device; the global one by
-            default.
-        observation_key: leaf of the states; the model's by default.
-        goal_key: leaf of the goals; the model's by default.
-        action_key: leaf where the action is written; the model's by default.
-        is_init_key: leaf that marks the first step of an episode.
-        plan_key: leaf that carries the plan.
-        actions_key: leaf that carries the decoded actions (open loop).
-        step_key: leaf that carries the number of steps played of the window.
+        sample (bool): whether plans are sampled (as in the paper) or the prior's mean,
+            if no exploration type is set. An exploration type takes precedence:
+            ``ExplorationType.RANDOM`` samples, any other plays the mean. Defaults to
+            ``True``.
+        generator (torch.Generator, optional): the generator of the noise, on any
+            device. Defaults to the global one.
+        observation_key (NestedKey, optional): the states. Defaults to the model's.
+        goal_key (NestedKey, optional): the goals. Defaults to the model's.
+        action_key (NestedKey, optional): where the action is written. Defaults to the
+            model's.
+        is_init_key (NestedKey): the flag of the first step of an episode. Defaults to
+            ``"is_init"``.
+        plan_key (NestedKey): where the plan is carried. Defaults to
+            ``("lmp", "plan")``.
+        actions_key (NestedKey): where the decoded actions are carried (open loop).
+            Defaults to ``("lmp", "actions")``.
+        step_key (NestedKey): where the number of steps since the start of the window
+            is carried. Defaults to ``("lmp", "step")``.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_caiac.modules.lmp import LMPModel
+        >>> from torchrl_caiac.modules import LMPActor, LMPModel
         >>> model = LMPModel(observation_dim=5, goal_dim=2, action_dim=3, window=10)
         >>> actor = LMPActor(model)
         >>> td = TensorDict(
@@ -116,22 +117,22 @@ class LMPActor(TensorDictModuleBase):
         self.out_keys = [self.action_key, *map(_next, self.state_keys)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Chooses one action a row.
+        """Chooses one action for each environment.
 
         Args:
-            tensordict: holds states ``[*B, D]``, goals ``[*B, G]``, ``"is_init"``
-                ``[*B, 1]`` (optional where the primer is appended) and the leaves
-                that the actor carries.
+            tensordict (TensorDictBase): states ``[*B, D]``, goals ``[*B, G]``,
+                ``"is_init"`` ``[*B, 1]`` (optional if the primer is appended) and the
+                leaves that the actor carries.
 
         Returns:
-            The same tensordict with the action ``[*B, A]`` and, under ``"next"``,
-            the carried leaves.
+            TensorDictBase: the same tensordict with the action ``[*B, A]`` and, under
+            ``"next"``, the carried leaves.
 
         Raises:
-            KeyError: if a leaf is missing; without the carried leaves every row
-                must be marked by ``"is_init"``.
-            ValueError: if a leaf has the wrong shape, or a window starts in a state
-                or with a goal that is not finite.
+            KeyError: a leaf is missing. The carried leaves may be missing if
+                ``"is_init"`` is true everywhere.
+            ValueError: a leaf has the wrong shape, or the state or the goal at the
+                start of a window is not finite.
         """
         model = self.model
         observation = read_leaf(tensordict, self.observation_key, model.observation_dim)
@@ -163,11 +164,11 @@ class LMPActor(TensorDictModuleBase):
         """Draws the noise of new plans.
 
         Args:
-            loc: mean of the plans, ``[*B, P]``.
+            loc (torch.Tensor): the mean of the plans, ``[*B, P]``.
 
         Returns:
-            Standard normal noise ``[*B, P]``, one draw a row whether a window
-            starts there or not; None where the plan's mean is to be played.
+            torch.Tensor, optional: standard normal noise ``[*B, P]``, also for rows in
+            which no window starts; ``None`` if the mean of the plan is played.
         """
         if not plan_is_sampled(self.sample):
             return None
@@ -180,21 +181,21 @@ class LMPActor(TensorDictModuleBase):
         )
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Makes the transform through which an environment carries the state.
+        """Returns the transform with which an environment carries the actor's state.
 
         Returns:
-            A ``TensorDictPrimer`` for plan, actions and step counter, all zeros at
-            a reset, so that an environment's reset starts a window there.
+            TensorDictPrimer: the transform. It sets plan, actions and step counter to
+            zero at a reset, which starts a window.
 
         Examples:
-            >>> from torchrl_caiac.modules.lmp import LMPModel
+            >>> from torchrl_caiac.modules import LMPActor, LMPModel
             >>> actor = LMPActor(LMPModel(5, 2, 3, window=10))
             >>> primer = actor.make_tensordict_primer()
             >>> primer.primers["lmp", "actions"].shape
             torch.Size([10, 3])
         """
         model = self.model
-        dtype = model.observation_norm.mean.dtype
+        dtype = model.observation_norm.dtype
         specs = {
             self.plan_key: Unbounded(shape=(model.plan_dim,), dtype=dtype),
             self.step_key: Unbounded(shape=(1,), dtype=torch.int64),
@@ -207,16 +208,16 @@ class LMPActor(TensorDictModuleBase):
     def _read_state(
         self, tensordict: TensorDictBase, observation: Tensor
     ) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Carried leaves as they are at this step; zeros where an episode starts."""
+        """Returns the carried leaves; the step is zero where an episode starts."""
         model = self.model
         batch = observation.shape[:-1]
-        dtype = model.observation_norm.mean.dtype
+        dtype = model.observation_norm.dtype
         is_init = tensordict.get(self.is_init_key, None)
         if is_init is not None:
             if is_init.numel() != batch.numel():
                 raise ValueError(
-                    f"{self.is_init_key!r} has shape {tuple(is_init.shape)}, but one "
-                    f"value a row is needed, {(*batch, 1)}."
+                    f"{self.is_init_key!r} has the shape {list(is_init.shape)}, "
+                    f"expected {[*batch, 1]}: one flag for each environment"
                 )
             is_init = is_init.reshape(*batch, 1).bool()
         shapes: dict[NestedKey, tuple[int, ...]] = {
@@ -231,10 +232,10 @@ class LMPActor(TensorDictModuleBase):
             if value is None:
                 if is_init is None or not is_init.all():
                     raise KeyError(
-                        f"{key!r} is missing, and {self.is_init_key!r} does not mark "
-                        "every row as the first of an episode: append "
-                        "actor.make_tensordict_primer() to the environment, or carry "
-                        "the leaves that the actor writes under 'next' to the root."
+                        f"{key!r} is missing, and {self.is_init_key!r} is not true "
+                        "everywhere: append actor.make_tensordict_primer() to the "
+                        "environment, or move the leaves that the actor writes under "
+                        "'next' to the root"
                     )
                 counter = key == self.step_key
                 value = observation.new_zeros(
@@ -242,8 +243,8 @@ class LMPActor(TensorDictModuleBase):
                 )
             if value.shape != (*batch, *shape):
                 raise ValueError(
-                    f"{key!r} has shape {tuple(value.shape)}, but {(*batch, *shape)} "
-                    "is needed: the primer belongs to another model."
+                    f"{key!r} has the shape {list(value.shape)}, expected "
+                    f"{[*batch, *shape]}: take the primer from this actor"
                 )
             state[key] = value
         step = state[self.step_key] % model.window
@@ -257,15 +258,15 @@ class LMPActor(TensorDictModuleBase):
         model = self.model
         if goal.shape[:-1] != observation.shape[:-1]:
             raise ValueError(
-                f"{self.goal_key!r} has shape {tuple(goal.shape)}, but "
-                f"{self.observation_key!r} has {tuple(observation.shape)}: all "
-                "dimensions but the last must agree."
+                f"{self.goal_key!r} has the shape {list(goal.shape)}, but "
+                f"{self.observation_key!r} has {list(observation.shape)}: all "
+                "dimensions but the last must agree"
             )
         for key, value in ((self.observation_key, observation), (self.goal_key, goal)):
             if not (value.isfinite() | ~start).all():
                 raise ValueError(
-                    f"{key!r} is not finite where a window starts: check the "
-                    "environment."
+                    f"{key!r} is not finite at the start of a window: check the "
+                    "environment"
                 )
         td = TensorDict(batch_size=observation.shape[:-1])
         td.set(model.observation_key, observation)
@@ -283,5 +284,5 @@ class LMPActor(TensorDictModuleBase):
 
 
 def _next(key: NestedKey) -> NestedKey:
-    """The key under ``"next"``."""
-    return unravel_key(("next", key))
+    """Returns the key under ``"next"``."""
+    return join("next", key)

@@ -15,7 +15,7 @@ from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_caiac._torchrl import priority_weight, reduce_loss, vmap_loss
-from torchrl_caiac.modules.goal_features import read
+from torchrl_caiac.modules.goal_features import read_leaves
 from torchrl_caiac.modules.goal_networks import takes_params
 
 __all__ = ["GoalConditionedTD3Loss"]
@@ -390,7 +390,7 @@ class GoalConditionedTD3Loss(TD3Loss):
     ) -> torch.Tensor:
         keys = self.tensor_keys
         for name in (keys.reward, keys.terminated):
-            shape = read(tensordict, [("next", name)])[0].shape
+            shape = read_leaves(tensordict, [("next", name)])[0].shape
             if shape != (*next_value.shape, 1):
                 raise ValueError(
                     f"{('next', name)!r} has the shape {list(shape)}, wanted "
@@ -406,11 +406,11 @@ class GoalConditionedTD3Loss(TD3Loss):
         self, action: torch.Tensor, tensordict: TensorDictBase
     ) -> torch.Tensor:
         """The squared error of the actions, ``[*B]``; its mean is that of kept rows."""
-        (expert,) = read(tensordict, [self.tensor_keys.action])
+        (expert,) = read_leaves(tensordict, [self.tensor_keys.action])
         error = (action - expert).square().mean(-1)
         if self.bc_mask_key is None:
             return error
-        (masked,) = read(tensordict, [self.bc_mask_key])
+        (masked,) = read_leaves(tensordict, [self.bc_mask_key])
         if masked.dtype != torch.bool or masked.numel() != error.numel():
             raise ValueError(
                 f"{self.bc_mask_key!r} has the shape {list(masked.shape)} and dtype "
@@ -435,7 +435,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             ("next", key) if after and not self._goal(key) else key for key in keys
         ]
         return TensorDict(
-            dict(zip(keys, read(tensordict, sources), strict=True)),
+            dict(zip(keys, read_leaves(tensordict, sources), strict=True)),
             tensordict.batch_size,
             device=tensordict.device,
         )

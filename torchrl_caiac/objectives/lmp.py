@@ -14,7 +14,8 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_caiac._random import draw_numbers
 from torchrl_caiac._torchrl import loss_masks
-from torchrl_caiac.modules.lmp import LMPModel, gaussian_plan, read_leaf
+from torchrl_caiac.modules.lmp import LMPModel, read_leaf
+from torchrl_caiac.modules.lmp_parts import gaussian_plan
 
 __all__ = ["LMPLoss", "balanced_kl", "gaussian_kl"]
 
@@ -22,27 +23,28 @@ __all__ = ["LMPLoss", "balanced_kl", "gaussian_kl"]
 def gaussian_kl(
     loc_q: Tensor, log_std_q: Tensor, loc_p: Tensor, log_std_p: Tensor
 ) -> Tensor:
-    """KL divergence between two diagonal Gaussians, summed over the last dimension.
+    """Returns the KL divergence of two diagonal Gaussians, summed over dimensions.
 
     Args:
-        loc_q: mean of q, ``[*B, P]``.
-        log_std_q: logarithm of q's standard deviation, ``[*B, P]``.
-        loc_p: mean of p, ``[*B, P]``.
-        log_std_p: logarithm of p's standard deviation, ``[*B, P]``.
+        loc_q (torch.Tensor): the mean of q, ``[*B, P]``.
+        log_std_q (torch.Tensor): the log standard deviation of q, ``[*B, P]``.
+        loc_p (torch.Tensor): the mean of p, ``[*B, P]``.
+        log_std_p (torch.Tensor): the log standard deviation of p, ``[*B, P]``.
 
     Returns:
-        KL(q || p) in nats, ``[*B]``.
+        torch.Tensor: KL(q || p) in nats, ``[*B]``.
 
     Examples:
         >>> import torch
+        >>> from torchrl_caiac.objectives.lmp import gaussian_kl
         >>> zero = torch.zeros(2)
         >>> gaussian_kl(torch.ones(2), zero, zero, zero)
         tensor(1.)
     """
     log_ratio = log_std_q - log_std_p
     distance = (loc_q - loc_p) * torch.exp(-log_std_p)
-    # Variances enter, hence twice the log deviations; expm1 keeps the digits where
-    # both distributions are nearly the same.
+    # The formula needs variances, hence twice the log standard deviations. expm1 keeps
+    # the precision if both distributions are nearly the same.
     per_dim = 0.5 * (torch.expm1(2.0 * log_ratio) + distance.square()) - log_ratio
     return per_dim.sum(-1)
 
@@ -54,24 +56,26 @@ def balanced_kl(
     log_std_p: Tensor,
     balance: float | Tensor,
 ) -> Tensor:
-    """KL(q || p) whose gradient is split between p and q (paper A.5.1).
+    """Returns KL(q || p), with its gradient divided between p and q (paper, A.5.1).
 
-    The value is that of :func:`gaussian_kl`; the gradient for p's parameters is
-    ``balance`` times the whole, the one for q's ``1 - balance`` times: early in
-    training the posterior is not drawn towards a prior that knows nothing yet.
+    The value is that of :func:`gaussian_kl`. The gradient of p's parameters is
+    multiplied by ``balance``, that of q's by ``1 - balance``. Early in training, the
+    posterior is thereby not pulled towards an untrained prior.
 
     Args:
-        loc_q: mean of q, ``[*B, P]``.
-        log_std_q: logarithm of q's standard deviation, ``[*B, P]``.
-        loc_p: mean of p, ``[*B, P]``.
-        log_std_p: logarithm of p's standard deviation, ``[*B, P]``.
-        balance: share of the gradient that p's parameters get, in [0, 1].
+        loc_q (torch.Tensor): the mean of q, ``[*B, P]``.
+        log_std_q (torch.Tensor): the log standard deviation of q, ``[*B, P]``.
+        loc_p (torch.Tensor): the mean of p, ``[*B, P]``.
+        log_std_p (torch.Tensor): the log standard deviation of p, ``[*B, P]``.
+        balance (float or torch.Tensor): the fraction of the gradient for p's
+            parameters, in [0, 1].
 
     Returns:
-        KL(q || p) in nats, ``[*B]``.
+        torch.Tensor: KL(q || p) in nats, ``[*B]``.
 
     Examples:
         >>> import torch
+        >>> from torchrl_caiac.objectives.lmp import balanced_kl
         >>> q = torch.ones(1, requires_grad=True)
         >>> p = torch.zeros(1, requires_grad=True)
         >>> zero = torch.zeros(1)
@@ -85,43 +89,47 @@ def balanced_kl(
 
 
 class LMPLoss(LossModule):
-    """Loss of Latent Motor Plans on windows (paper A.5.1).
+    """The loss of Latent Motor Plans on windows (paper, A.5.1).
 
-    Every window is encoded by the posterior, a plan is drawn with a reparameterized
-    sample, and the decoder gives the actions back. Two losses come out, to be
-    summed: ``"loss_reconstruction"``, the squared error summed over the actions and
-    averaged over the valid steps, times ``reconstruction_weight``; and
-    ``"loss_kl"``, KL(posterior || prior) times ``kl_weight``, with its gradient
-    balanced between the two. The prior sees a window's first state and first goal.
+    The posterior encodes each window, a plan is drawn with the reparameterisation
+    trick, and the decoder reconstructs the actions. The result has two losses, whose
+    sum is minimised: ``"loss_reconstruction"`` is the squared error, summed over the
+    action dimensions and averaged over the valid steps, times
+    ``reconstruction_weight``; ``"loss_kl"`` is KL(posterior || prior) times
+    ``kl_weight``, with its gradient balanced between the two. The prior reads the first
+    state and the first goal of a window.
 
-    The batch holds windows: leaves of shape ``[*B, κ, ...]``. Samples of a
-    ``SliceSampler`` come flat, ``batch.reshape(-1, κ)`` makes windows of them.
-    Windows that are padded at their end carry a bool leaf ``"mask"``, ``[*B, κ]``
-    (or ``[*B, κ, 1]``), True at the valid steps; the masks that TorchRL itself
-    writes (``loss_mask_key``, see ``LossModule``) are honoured too.
+    A batch contains windows: leaves of the shape ``[*B, κ, ...]``. Samples of a
+    ``SliceSampler`` are flat; ``batch.reshape(-1, κ)`` turns them into windows. Windows
+    that are padded at their end have a bool leaf ``"mask"``, ``[*B, κ]`` or
+    ``[*B, κ, 1]``, true for the valid steps. TorchRL's own masks (``loss_mask_key`` of
+    :class:`~torchrl.objectives.LossModule`) are honoured too.
 
-    The model is kept as it is (``functional`` is False): the loss's parameters are
-    the model's.
+    The loss is not functional: its parameters are the model's.
 
     Args:
-        model: the parts to be trained.
-        kl_weight: weight of the KL divergence; a buffer that can be assigned to.
-        kl_balance: share of the KL's gradient that goes to the prior; a buffer.
-        reconstruction_weight: weight of the squared error; a buffer.
+        model (LMPModel): the model to train.
+        kl_weight (float): the weight of the KL divergence, a buffer that may be
+            assigned to. Defaults to ``1.0``.
+        kl_balance (float): the fraction of the KL divergence's gradient for the prior,
+            a buffer. Defaults to ``0.8``.
+        reconstruction_weight (float): the weight of the squared error, a buffer.
+            Defaults to ``2.0``.
 
     Keyword Args:
-        reduction: ``"mean"`` or ``"sum"`` over windows, or ``"none"``, which gives
-            ``[*B]``.
-        generator: source of the plans' noise, of any device; the global one by
-            default.
+        reduction (str): ``"mean"`` or ``"sum"`` over the windows, or ``"none"``, which
+            gives ``[*B]``. Defaults to ``"mean"``.
+        generator (torch.Generator, optional): the generator of the noise of plans, on
+            any device. Defaults to the global one.
 
     Raises:
-        ValueError: if a weight, the balance or the reduction is out of range.
+        ValueError: a weight, the balance or the reduction is out of range.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_caiac.modules.lmp import LMPModel
+        >>> from torchrl_caiac.modules import LMPModel
+        >>> from torchrl_caiac.objectives import LMPLoss
         >>> model = LMPModel(observation_dim=5, goal_dim=2, action_dim=3, window=10)
         >>> loss = LMPLoss(model)
         >>> flat = TensorDict(
@@ -140,13 +148,15 @@ class LMPLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Leaves of the input that can be renamed with ``set_keys``.
+        """The keys that ``set_keys`` accepts. They default to those of the model.
 
         Attributes:
-            observation: states ``[*B, κ, D]``.
-            action: actions ``[*B, κ, A]``.
-            desired_goal: goals ``[*B, κ, G]``; the first row of a window is read.
-            mask: optional, bool ``[*B, κ]`` or ``[*B, κ, 1]``, True where valid.
+            observation (NestedKey): states ``[*B, κ, D]``.
+            action (NestedKey): actions ``[*B, κ, A]``.
+            desired_goal (NestedKey): goals ``[*B, κ, G]``; the first of each window is
+                read.
+            mask (NestedKey): bool ``[*B, κ]`` or ``[*B, κ, 1]``, true for the valid
+                steps; optional.
         """
 
         observation: NestedKey = "observation"
@@ -176,17 +186,16 @@ class LMPLoss(LossModule):
         generator: torch.Generator | None = None,
     ) -> None:
         if not kl_weight >= 0.0:
-            raise ValueError(f"kl_weight must be at least 0, found {kl_weight}.")
+            raise ValueError(f"kl_weight must be at least 0, got {kl_weight}")
         if not 0.0 <= kl_balance <= 1.0:
-            raise ValueError(f"kl_balance must lie in [0, 1], found {kl_balance}.")
+            raise ValueError(f"kl_balance must be in [0, 1], got {kl_balance}")
         if not reconstruction_weight >= 0.0:
             raise ValueError(
-                "reconstruction_weight must be at least 0, found "
-                f"{reconstruction_weight}."
+                f"reconstruction_weight must be at least 0, got {reconstruction_weight}"
             )
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(
-                f"reduction must be 'none', 'mean' or 'sum', found {reduction!r}."
+                f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}"
             )
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
@@ -208,7 +217,7 @@ class LMPLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """False: the model keeps its parameters."""
+        """``False``: the model keeps its parameters."""
         return False
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
@@ -216,7 +225,7 @@ class LMPLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """The leaves that must be there; the mask is optional and not among them."""
+        """The required leaves, without the optional mask."""
         if self._in_keys is None:
             keys = self.tensor_keys
             self._in_keys = [keys.observation, keys.action, keys.desired_goal]
@@ -228,7 +237,7 @@ class LMPLoss(LossModule):
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """The losses, then the detached values for logs."""
+        """The losses, then the detached values for logging."""
         if self._out_keys is None:
             self._out_keys = ["loss_reconstruction", "loss_kl", "kl", "mse"]
         return self._out_keys
@@ -242,18 +251,19 @@ class LMPLoss(LossModule):
         """Computes both losses.
 
         Args:
-            tensordict: windows, ``[*B, κ]``, see the class.
+            tensordict (TensorDictBase): windows, ``[*B, κ]``.
 
         Returns:
-            A tensordict with ``"loss_reconstruction"``, ``"loss_kl"`` and, detached,
-            ``"kl"`` (without its weight) and ``"mse"`` (the squared error averaged
-            over actions too); scalars, or ``[*B]`` for the reduction ``"none"``.
+            TensorDictBase: ``"loss_reconstruction"``, ``"loss_kl"`` and, detached,
+            ``"kl"`` (without its weight) and ``"mse"`` (the squared error, also
+            averaged over the action dimensions); scalars, or ``[*B]`` with the
+            reduction ``"none"``.
 
         Raises:
-            KeyError: if a leaf is missing.
-            ValueError: if a leaf has the wrong shape, windows have another length
-                than the model's, the mask is not True at a window's first steps
-                and False after them, or if states, goals or actions are not finite.
+            KeyError: a leaf is missing.
+            ValueError: a leaf has the wrong shape, the windows have another length than
+                the model's, the mask is not true for the first steps of a window and
+                false for the others, or a value is not finite.
         """
         model = self.model
         observation, action, goal, mask = self._read(tensordict)
@@ -268,15 +278,15 @@ class LMPLoss(LossModule):
         loc_q = encoded.get(model.posterior_loc_key)
         log_std_q = encoded.get(model.posterior_log_std_key)
 
-        foretold = TensorDict(batch_size=batch)
-        foretold.set(model.observation_key, observation[..., 0, :])
-        foretold.set(model.goal_key, goal[..., 0, :])
-        foretold = model.prior(foretold)
-        loc_p = foretold.get(model.prior_loc_key)
-        log_std_p = foretold.get(model.prior_log_std_key)
+        predicted = TensorDict(batch_size=batch)
+        predicted.set(model.observation_key, observation[..., 0, :])
+        predicted.set(model.goal_key, goal[..., 0, :])
+        predicted = model.prior(predicted)
+        loc_p = predicted.get(model.prior_loc_key)
+        log_std_p = predicted.get(model.prior_log_std_key)
 
-        # Losses run in deterministic exploration mode, so the sample is drawn here
-        # and not left to a probabilistic module.
+        # Losses run with the deterministic exploration type, under which a
+        # probabilistic module would not sample.
         noise = draw_numbers(
             torch.randn,
             loc_q.shape,
@@ -323,34 +333,34 @@ class LMPLoss(LossModule):
         goal = read_leaf(tensordict, keys.desired_goal, model.goal_dim)
         if observation.ndim < 2:
             raise ValueError(
-                f"{keys.observation!r} has shape {tuple(observation.shape)}, but "
-                f"windows [*B, {model.window}, {model.observation_dim}] are needed: "
-                f"reshape a flat batch with batch.reshape(-1, {model.window})."
+                f"{keys.observation!r} has the shape {list(observation.shape)}, "
+                f"expected windows [*B, {model.window}, {model.observation_dim}]: "
+                f"reshape a flat batch with batch.reshape(-1, {model.window})"
             )
         rows = observation.shape[:-1]
         for key, value in ((keys.action, action), (keys.desired_goal, goal)):
             if value.shape[:-1] != rows:
                 raise ValueError(
-                    f"{key!r} has shape {tuple(value.shape)}, but {keys.observation!r} "
-                    f"has {tuple(observation.shape)}: all dimensions but the last "
-                    "must agree."
+                    f"{key!r} has the shape {list(value.shape)}, but "
+                    f"{keys.observation!r} has {list(observation.shape)}: all "
+                    "dimensions but the last must agree"
                 )
         if rows.numel() == 0:
             raise ValueError(
-                f"{keys.observation!r} has shape {tuple(observation.shape)}: the "
-                "batch holds no window."
+                f"{keys.observation!r} has the shape {list(observation.shape)}: the "
+                "batch has no window"
             )
         mask = self._read_mask(tensordict, rows)
         length = rows[-1]
         if length > model.window or (length < model.window and mask is None):
             raise ValueError(
-                f"{keys.observation!r} has shape {tuple(observation.shape)}: windows "
-                f"of {length} steps, but the model was built for {model.window}. "
-                f"Reshape a flat batch with batch.reshape(-1, {model.window}), or pad "
-                f"shorter windows and mark their valid steps in {keys.mask!r}."
+                f"{keys.observation!r} has the shape {list(observation.shape)}, "
+                f"windows of {length} steps, expected {model.window}: reshape a flat "
+                f"batch with batch.reshape(-1, {model.window}), or pad shorter windows "
+                f"and flag their valid steps in {keys.mask!r}"
             )
         if mask is not None:
-            # Padding may hold anything, so it is blanked before it meets a network.
+            # Padding may contain anything, and must not reach a network.
             blank = ~mask.unsqueeze(-1)
             observation = observation.masked_fill(blank, 0.0)
             action = action.masked_fill(blank, 0.0)
@@ -364,16 +374,14 @@ class LMPLoss(LossModule):
                 continue
             if mask.dtype != torch.bool or mask.shape not in (rows, (*rows, 1)):
                 raise ValueError(
-                    f"{key!r} has shape {tuple(mask.shape)} and dtype {mask.dtype}, "
-                    f"but a bool mask of shape {tuple(rows)} is needed, True at the "
-                    "valid steps."
+                    f"{key!r} is {mask.dtype} of the shape {list(mask.shape)}, "
+                    f"expected bool {list(rows)}, true for the valid steps"
                 )
             mask = mask.reshape(rows)
             if not mask[..., 0].all() or (mask[..., 1:] & ~mask[..., :-1]).any():
                 raise ValueError(
-                    f"{key!r} must be True at the first steps of every window, at "
-                    "least one, and False after them: only windows padded at their "
-                    "end are supported."
+                    f"{key!r} must be true for the first steps of every window, at "
+                    "least one, and false for the others: pad windows at their end only"
                 )
             found = mask if found is None else found & mask
         return found
@@ -381,7 +389,7 @@ class LMPLoss(LossModule):
     def _name_non_finite(
         self, observation: Tensor, action: Tensor, goal: Tensor
     ) -> None:
-        """Raises if the input is to blame for a loss that is not finite."""
+        """Raises if the input is the cause of a non-finite loss."""
         keys = self.tensor_keys
         for key, value in (
             (keys.observation, observation),
@@ -391,6 +399,6 @@ class LMPLoss(LossModule):
             count = int((~value.isfinite()).sum())
             if count:
                 raise ValueError(
-                    f"{key!r} holds {count} non-finite values in a batch of shape "
-                    f"{tuple(value.shape)}: remove or repair these rows in the data."
+                    f"{key!r} has {count} non-finite values in a batch of the shape "
+                    f"{list(value.shape)}: remove or repair these rows in the data"
                 )
