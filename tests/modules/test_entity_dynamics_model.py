@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
     evaluating,
-    with_class,
 )
 from torchrl_caiac.objectives import EntityDynamicsLoss
 
@@ -98,21 +96,6 @@ def test_configs_name_their_class() -> None:
         TransformerWorldModel.from_config(gaussian.config)
     with pytest.raises(ValueError, match=r"another class(.|\n)*TransformerWorldModel"):
         gaussian.load_state_dict(transformer.state_dict(), strict=False)
-
-
-def test_what_was_saved_without_a_class_is_gaussian(tmp_path: Path) -> None:
-    data, path = transitions(), tmp_path / "fit"
-    model = GaussianWorldModel(LAYOUT, 2, (8,))
-    kwargs: Any = {"batch_size": 16, "eval_every": 5, "progress": False}
-    fit_world_model(model, data, steps=5, checkpoint=path, **kwargs)
-    old = {k: v for k, v in model.config.items() if k != "class"}
-    assert with_class(old) == model.config
-    assert GaussianWorldModel.from_config(old).config == model.config
-    state = model.state_dict()
-    state["_extra_state"] = {**state["_extra_state"], "config": json.dumps(old)}
-    twin = GaussianWorldModel(LAYOUT, 2, (8,))
-    twin.load_state_dict(state)
-    torch.testing.assert_close(twin.loc_head.weight, model.loc_head.weight)
 
 
 def test_evaluating_restores_every_part() -> None:

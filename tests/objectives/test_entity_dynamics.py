@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules import linear
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
 from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss, gaussian_nll
@@ -204,3 +205,27 @@ def test_wrong_arguments() -> None:
         EntityDynamicsLoss(GaussianWorldModel(LAYOUT, 2, (8,)))(td)
     with pytest.raises(KeyError, match="next"):
         EntityDynamicsLoss(fitted(td))(td.exclude("next"))
+
+
+@pytest.mark.parametrize("functional", [True, False])
+def test_compiles_without_graph_breaks(
+    functional: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linear, "_SMALL", 0)  # the choice of the library is traced too
+    td = transitions(8)
+    losses = [EntityDynamicsLoss(fitted(td), functional=functional) for _ in range(2)]
+    want = losses[0](td)
+    got = torch.compile(losses[1], fullgraph=True, backend="eager")(td)
+    for key in losses[0].out_keys:
+        torch.testing.assert_close(got[key], want[key])
+    counts = [loss.model.state_norm.count for loss in losses]
+    assert counts == [8, 8]
+    got["loss_nll"].backward()
+    assert all(parameter.grad is not None for parameter in losses[1].parameters())
+
+
+def test_out_keys_can_be_selected() -> None:
+    td = transitions(4)
+    loss = EntityDynamicsLoss(fitted(td)).select_out_keys("loss_nll")
+    assert loss.out_keys == ["loss_nll"] and list(loss(td).keys()) == ["loss_nll"]
+    assert EntityDynamicsLoss(fitted(td)).out_keys == ["loss_nll", "mse"]

@@ -1,4 +1,4 @@
-"""What world models share: normalised targets, checks, and saving."""
+"""The base class of world models: normalised targets, checks, and saving."""
 
 from __future__ import annotations
 
@@ -10,58 +10,65 @@ from typing import Any, Literal, TypeVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import nn
 
+from torchrl_caiac._keys import as_key, jsonable, key_from_json
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules._predicted_columns import (
+    checked_floor,
+    checked_predict,
+    checked_widths,
+)
 from torchrl_caiac.modules.running_norm import RunningNorm
 
-__all__ = ["EntityDynamicsModel", "evaluating", "with_class"]
+__all__ = ["EntityDynamicsModel", "evaluating"]
 
 _Model = TypeVar("_Model", bound="EntityDynamicsModel")
 
-_STATISTICS_ROWS = 65_536  # rows read at once where statistics are gathered
+_STATISTICS_ROWS = 65_536  # rows read at once for the statistics of the targets
 
 
 class EntityDynamicsModel(TensorDictModuleBase):
-    r"""A model of how the action moves every entity, without its network.
+    r"""The base class of models that predict how an action moves every entity.
 
-    It reads the features of all ``N`` entities (``W`` numbers,
-    :meth:`EntityLayout.read`) and the action (``A``), and predicts ``P`` columns of
-    the next state. Subclasses define two methods: ``forward_tensors(state, action)``,
-    a tuple of the tensors under :attr:`out_keys`, the expectation of the normalised
-    target first, and ``nll(prediction, target)``, what
+    A model reads the features of all ``N`` entities (``W`` numbers,
+    :meth:`~torchrl_caiac.EntityLayout.read`) and the action (``A``), and predicts
+    ``P`` columns of the next state. Subclasses define two methods:
+    ``forward_tensors(state, action)`` returns a tuple of the tensors under
+    :attr:`out_keys`, the expectation of the normalised target first;
+    ``nll(prediction, target)`` returns what
     :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises. They normalise
-    their inputs by ``state_norm`` and ``action_norm``, and add their own arguments to
-    :attr:`config`.
+    their inputs with ``state_norm`` and ``action_norm``, and add their own arguments
+    to :attr:`config`.
 
     The *normalised target* is by default the change of each column over the step,
-    divided by its standard deviation in the data, or by the floor where that is
-    smaller.
+    divided by its standard deviation in the data, or by the floor if that is larger.
 
     Args:
         layout (EntityLayout): the entities.
         action_dim (int): the size ``A`` of the action.
-        predict (mapping of str to iterable of int, optional): the columns to predict of
-            some entities; the others are predicted whole. Flat layouts: observation
-            columns that the entity owns. Nested layouts: positions in the entity's
-            flattened features. ``()`` leaves an entity out (it then has no score).
+        predict (Mapping of str to iterable of int, optional): the columns to predict
+            of some entities; all columns of the others are predicted. For flat layouts
+            observation columns that the entity owns, for nested layouts positions in
+            the entity's flattened features. ``()`` leaves an entity out: it then has no
+            score. Defaults to all columns.
 
     Keyword Args:
-        widths (mapping of str to int, optional): the features of each entity,
-            ``layout.widths(td)``. Needed by nested layouts only.
-        action_key (NestedKey): defaults to ``"action"``.
+        widths (Mapping of str to int, optional): the number of features of each
+            entity, ``layout.widths(td)``. Required for nested layouts only.
+        action_key (NestedKey): the action. Defaults to ``"action"``.
         out_keys (sequence of NestedKey): where the prediction is written.
-        target (str): ``"change"`` (next minus now) or ``"absolute"`` (the next state,
-            centred). Defaults to ``"change"``.
-        variance_floor (float or mapping): a standard deviation in physical units:
-            columns that change less are not blown up to unit variance. One number, or
-            per entity one number or one for each predicted column. Defaults to
-            ``1e-3`` (1 mm, 1 mrad).
+        target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
+            next state, centred). Defaults to ``"change"``.
+        variance_floor (float or Mapping): the smallest standard deviation to divide
+            targets by, in physical units. One number, or for each entity one number or
+            one for each predicted column. Defaults to ``1e-3`` (1 mm, 1 mrad).
 
     Attributes:
-        predicted (dict of str to slice): where each predicted entity lies in ``P``.
-        slices (dict of str to slice): where each entity lies in ``W``.
+        predicted (dict of str to slice): the position of each predicted entity in
+            ``P``.
+        slices (dict of str to slice): the position of each entity in ``W``.
 
     Raises:
         ValueError: an argument does not fit the layout.
@@ -100,22 +107,21 @@ class EntityDynamicsModel(TensorDictModuleBase):
         super().__init__()
         if not isinstance(action_dim, int) or action_dim < 1:
             raise ValueError(
-                f"action_dim is the size of the action, an int of at least 1, got "
-                f"{action_dim!r}"
+                f"action_dim must be an int of at least 1, got {action_dim!r}"
             )
         if target not in ("change", "absolute"):
-            raise ValueError(f"target is 'change' or 'absolute', got {target!r}")
+            raise ValueError(f"target must be 'change' or 'absolute', got {target!r}")
         self.layout = layout
         self.action_dim = action_dim
         self.target = target
-        self.action_key: NestedKey = unravel_key(action_key)
+        self.action_key: NestedKey = as_key(action_key)
         self.in_keys = [*layout.in_keys, self.action_key]
-        self.out_keys = [unravel_key(key) for key in out_keys]
+        self.out_keys = [as_key(key) for key in out_keys]
         self.fitted = False
 
-        self.widths = _checked_widths(layout, widths)
-        self.predict = _checked_predict(layout, self.widths, predict)
-        floor = _checked_floor(variance_floor, self.predict)
+        self.widths = checked_widths(layout, widths)
+        self.predict = checked_predict(layout, self.widths, predict)
+        floor = checked_floor(variance_floor, self.predict)
         self.slices: dict[str, slice] = {}
         self.predicted: dict[str, slice] = {}
         start = stop = 0
@@ -148,7 +154,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
 
     @property
     def device(self) -> torch.device:
-        """Where the model computes."""
+        """The device of the model."""
         return self.target_loc.device
 
     # --- predicting --------------------------------------------------------------
@@ -156,29 +162,29 @@ class EntityDynamicsModel(TensorDictModuleBase):
     def forward_tensors(
         self, state: torch.Tensor, action: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """The prediction of the normalised target, from tensors.
+        """Predicts the normalised target from tensors.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
             action (torch.Tensor): ``[*B, A]``; batch dimensions broadcast.
 
         Returns:
-            tuple of torch.Tensor: the expectation ``[*B, P]``, and what else there is,
-            in the order of :attr:`out_keys`.
+            tuple of torch.Tensor: the tensors under :attr:`out_keys`, in their order,
+            the expectation ``[*B, P]`` first.
         """
         raise NotImplementedError(f"{type(self).__name__} has no forward_tensors")
 
     def nll(
         self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
     ) -> torch.Tensor:
-        """The negative log likelihood of a target, up to a constant.
+        """Returns the negative log likelihood of targets, up to a constant.
 
         Args:
-            prediction (tuple of torch.Tensor): what :meth:`forward_tensors` gave.
+            prediction (tuple of torch.Tensor): the output of :meth:`forward_tensors`.
             target (torch.Tensor): normalised targets ``[*B, P]``.
 
         Returns:
-            torch.Tensor: nats per column, ``[*B]``.
+            torch.Tensor: in nats per column, ``[*B]``.
         """
         raise NotImplementedError(f"{type(self).__name__} has no nll")
 
@@ -190,7 +196,8 @@ class EntityDynamicsModel(TensorDictModuleBase):
             tensordict (TensorDictBase): states and actions ``[*B]``.
 
         Returns:
-            TensorDictBase: the same, with :attr:`out_keys` set, each ``[*B, P]``.
+            TensorDictBase: the same tensordict with :attr:`out_keys`, each
+            ``[*B, P]``.
         """
         prediction = self.forward_tensors(
             self.layout.read(tensordict), tensordict.get(self.action_key)
@@ -206,22 +213,21 @@ class EntityDynamicsModel(TensorDictModuleBase):
         ):
             if x.ndim < 1 or x.shape[-1] != size:
                 raise ValueError(
-                    f"the {name} has the shape {list(x.shape)}, but this model reads "
-                    f"[*B, {size}]: pass the data that the model was made for"
+                    f"the {name} has the shape {list(x.shape)}, expected "
+                    f"[*B, {size}]: the model was made for other data"
                 )
 
     def predict_next(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """The expected next state, in physical units.
+        """Predicts the next state, in physical units.
 
         Args:
-            tensordict (TensorDictBase): states and actions ``[*B]``; nothing is
-                written.
+            tensordict (TensorDictBase): states and actions ``[*B]``, not changed.
 
         Returns:
             torch.Tensor: the predicted columns of all entities, ``[*B, P]``.
 
         Raises:
-            RuntimeError: :meth:`fit_statistics` was never called.
+            RuntimeError: :meth:`fit_statistics` was not called.
         """
         state = self.layout.read(tensordict)
         prediction = self.forward_tensors(state, tensordict.get(self.action_key))
@@ -232,11 +238,11 @@ class EntityDynamicsModel(TensorDictModuleBase):
     def raw_targets(
         self, state: torch.Tensor, next_state: torch.Tensor
     ) -> torch.Tensor:
-        """The target in physical units: the change, or the next state.
+        """Returns the target in physical units: the change, or the next state.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
-            next_state (torch.Tensor): the same after the step.
+            next_state (torch.Tensor): the same after the step, ``[*B, W]``.
 
         Returns:
             torch.Tensor: ``[*B, P]``.
@@ -245,40 +251,40 @@ class EntityDynamicsModel(TensorDictModuleBase):
         return after - state[..., self.index] if self.target == "change" else after
 
     def normalise(self, raw: torch.Tensor) -> torch.Tensor:
-        """The normalised target of a raw one, in the dtype of the parameters.
+        """Normalises raw targets, in the dtype of the parameters.
 
         Args:
-            raw (torch.Tensor): what :meth:`raw_targets` gave, ``[*B, P]``.
+            raw (torch.Tensor): the output of :meth:`raw_targets`, ``[*B, P]``.
 
         Returns:
             torch.Tensor: ``[*B, P]``.
 
         Raises:
-            RuntimeError: :meth:`fit_statistics` was never called.
+            RuntimeError: :meth:`fit_statistics` was not called.
         """
         self._check_fitted()
         loc, scale = (x.to(raw.dtype) for x in (self.target_loc, self.target_scale))
         return ((raw - loc) / scale).to(self.dtype)
 
     def physical(self, state: torch.Tensor, loc: torch.Tensor) -> torch.Tensor:
-        """The next state that a normalised target stands for.
+        """Returns the next state of normalised targets, the inverse of both.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
-            loc (torch.Tensor): a normalised target, ``[*B, P]``.
+            loc (torch.Tensor): normalised targets, ``[*B, P]``.
 
         Returns:
             torch.Tensor: the predicted columns, ``[*B, P]``, in physical units.
 
         Raises:
-            RuntimeError: :meth:`fit_statistics` was never called.
+            RuntimeError: :meth:`fit_statistics` was not called.
         """
         self._check_fitted()
         raw = loc * self.target_scale.to(loc.dtype) + self.target_loc.to(loc.dtype)
         return raw + state[..., self.index] if self.target == "change" else raw
 
     def targets(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """The normalised targets of transitions.
+        """Returns the normalised targets of transitions.
 
         Args:
             tensordict (TensorDictBase): transitions ``[*B]`` with next states.
@@ -287,7 +293,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
             torch.Tensor: ``[*B, P]``.
 
         Raises:
-            RuntimeError: :meth:`fit_statistics` was never called.
+            RuntimeError: :meth:`fit_statistics` was not called.
         """
         layout = self.layout
         return self.normalise(
@@ -302,31 +308,31 @@ class EntityDynamicsModel(TensorDictModuleBase):
     ) -> None:
         """Sets the scale (and for absolute targets the centre) of the targets.
 
-        Each predicted column gets the standard deviation of its raw target, but never
-        less than its floor.
+        The scale of a predicted column is the standard deviation of its raw target, or
+        its floor if that is larger.
 
         Args:
-            data (TensorDictBase or torch.Tensor or iterable of them): transitions
-                ``[T]``, read in chunks, or raw targets ``[T, P]``, or several.
+            data (TensorDictBase, torch.Tensor or iterable of them): transitions
+                ``[T]``, which are read in chunks, or raw targets ``[T, P]``.
 
         Raises:
-            ValueError: there is no row, or a value is not finite.
+            ValueError: the data are empty, or a value is not finite.
         """
         stats = RunningNorm(self.predict_dim).to(self.target_loc.device)
         for raw in self._raw_chunks(data):
             stats.update(raw)
         if not stats.count:
-            raise ValueError("there is no row to take the statistics from")
+            raise ValueError("the data are empty: give some transitions")
         if not bool(torch.isfinite(stats.var).all()):
             bad = (~torch.isfinite(stats.var)).nonzero()[0].item()
             name = self._owner(self.predicted, int(bad))
             raise ValueError(
-                f"the changes of entity {name!r} are not finite: remove the rows with "
-                "NaN or infinite observations"
+                f"the targets of entity {name!r} are not finite: remove transitions "
+                "with NaN or infinite observations"
             )
         scale = stats.var.sqrt()
         self.target_scale.copy_(torch.maximum(scale, self.floor))
-        # A column at rest whose floor is 0 has no scale at all.
+        # The scale of a constant column whose floor is 0.
         self.target_scale[self.target_scale == 0] = 1.0
         if self.target == "absolute":
             self.target_loc.copy_(stats.mean)
@@ -349,14 +355,14 @@ class EntityDynamicsModel(TensorDictModuleBase):
     def check_finite(
         self, state: torch.Tensor, *, next: bool = False, first_row: int = 0
     ) -> None:
-        """Raises when a state holds NaN or an infinity, naming entity and row.
+        """Raises an error that names entity and row if a state is not finite.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
 
         Keyword Args:
-            next (bool): these are next states. Defaults to ``False``.
-            first_row (int): added to the row in the message. Defaults to 0.
+            next (bool): whether these are next states. Defaults to ``False``.
+            first_row (int): the number of the first row. Defaults to ``0``.
 
         Raises:
             ValueError: a value is not finite.
@@ -372,18 +378,18 @@ class EntityDynamicsModel(TensorDictModuleBase):
         key = self.layout.next(key) if next else key
         raise ValueError(
             f"{key!r} is {value} for entity {name!r} in row {first_row + row} "
-            f"({int((~flat).any(-1).sum())} such rows): the world model needs finite "
-            "observations, remove or repair these rows"
+            f"({int((~flat).any(-1).sum())} such rows), expected finite observations: "
+            "remove or repair these rows"
         )
 
     def check_finite_action(self, action: torch.Tensor, *, first_row: int = 0) -> None:
-        """Raises when an action holds NaN or an infinity, naming the row.
+        """Raises an error that names the row if an action is not finite.
 
         Args:
             action (torch.Tensor): ``[*B, A]``.
 
         Keyword Args:
-            first_row (int): added to the row in the message. Defaults to 0.
+            first_row (int): the number of the first row. Defaults to ``0``.
 
         Raises:
             ValueError: a value is not finite.
@@ -396,8 +402,8 @@ class EntityDynamicsModel(TensorDictModuleBase):
         value = action.reshape(-1, action.shape[-1])[row, column].item()
         raise ValueError(
             f"{self.action_key!r} is {value} in column {column} of row "
-            f"{first_row + row} ({int((~flat).any(-1).sum())} such rows): the world "
-            "model needs finite actions, remove or repair these rows"
+            f"{first_row + row} ({int((~flat).any(-1).sum())} such rows), expected "
+            "finite actions: remove or repair these rows"
         )
 
     @staticmethod
@@ -407,14 +413,15 @@ class EntityDynamicsModel(TensorDictModuleBase):
     def _check_fitted(self) -> None:
         if not self.fitted:
             raise RuntimeError(
-                "the scale of the targets is not known yet: call "
+                "the scale of the targets is not known: call "
                 "model.fit_statistics(data), or fit_world_model(model, data), first"
             )
 
     # --- saving ------------------------------------------------------------------
+
     @property
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model, and its class, JSON-compatible."""
+        """The class of the model and its arguments, JSON-compatible."""
         floor = self.floor.tolist()
         return {
             "class": type(self).__name__,
@@ -422,24 +429,24 @@ class EntityDynamicsModel(TensorDictModuleBase):
             "action_dim": self.action_dim,
             "widths": dict(self.widths),
             "predict": {n: list(c) for n, c in self._predict_columns().items()},
-            "action_key": _jsonable(self.action_key),
-            "out_keys": [_jsonable(key) for key in self.out_keys],
+            "action_key": jsonable(self.action_key),
+            "out_keys": [jsonable(key) for key in self.out_keys],
             "target": self.target,
             "variance_floor": {n: floor[s] for n, s in self.predicted.items()},
         }
 
     @classmethod
     def from_config(cls: type[_Model], config: Mapping[str, Any]) -> _Model:
-        """Makes an untrained model like the one that :attr:`config` came from.
+        """Makes an untrained model with the arguments of another.
 
         Args:
-            config (mapping): the :attr:`config` of a model of this class.
+            config (Mapping): the :attr:`config` of a model of this class.
 
         Returns:
             EntityDynamicsModel: the model.
 
         Raises:
-            ValueError: the config is of another class.
+            ValueError: the config is that of another class.
 
         Examples:
             >>> from torchrl_caiac import EntityLayout
@@ -449,24 +456,24 @@ class EntityDynamicsModel(TensorDictModuleBase):
             >>> twin.load_state_dict(model.state_dict())
             <All keys matched successfully>
         """
-        kwargs = with_class(config)
-        named = kwargs.pop("class")
+        kwargs = dict(config)
+        named = kwargs.pop("class", None)
         if named != cls.__name__:
             raise ValueError(
-                f"the config is that of a {named}, not of a {cls.__name__}: call "
+                f"expected the config of a {cls.__name__}, got that of a {named}: call "
                 f"{named}.from_config"
             )
         kwargs["layout"] = EntityLayout.from_dict(kwargs["layout"])
-        kwargs["action_key"] = _key(kwargs["action_key"])
-        kwargs["out_keys"] = [_key(key) for key in kwargs["out_keys"]]
+        kwargs["action_key"] = key_from_json(kwargs["action_key"])
+        kwargs["out_keys"] = [key_from_json(key) for key in kwargs["out_keys"]]
         return cls(**kwargs)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What ``state_dict`` holds beside tensors: arguments, and whether fitted."""
+        """Returns the part of ``state_dict`` that is no tensor."""
         return {"config": json.dumps(self.config), "fitted": self.fitted}
 
     def set_extra_state(self, state: Any) -> None:
-        """Restores what :meth:`get_extra_state` gave."""
+        """Restores the output of :meth:`get_extra_state`."""
         self.fitted = bool(state["fitted"])
 
     def _load_from_state_dict(
@@ -475,8 +482,8 @@ class EntityDynamicsModel(TensorDictModuleBase):
         # Compared before any tensor is copied: a refused model stays as it was.
         extra = state_dict.get(f"{prefix}_extra_state")
         if extra is not None:
-            found, wanted = with_class(json.loads(extra["config"])), self.config
-            for name, value in json.loads(json.dumps(wanted)).items():
+            found = json.loads(extra["config"])
+            for name, value in json.loads(json.dumps(self.config)).items():
                 if found.get(name) == value:
                     continue
                 if name == "layout":
@@ -485,7 +492,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
                 raise ValueError(
                     f"the saved world model has another {name}, saved:\n"
                     f"{found.get(name)}\nthis model:\n{value}\nMake the model with "
-                    f"the arguments that were saved ({found['class']}.from_config)"
+                    f"the saved arguments ({found['class']}.from_config)"
                 )
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
@@ -498,7 +505,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
 
 @contextmanager
 def evaluating(module: nn.Module) -> Iterator[None]:
-    """Puts a module in evaluation mode, and each part back as it was."""
+    """Context manager that puts a module in evaluation mode for the block."""
     modes = [(part, part.training) for part in module.modules()]
     module.eval()
     try:
@@ -506,103 +513,3 @@ def evaluating(module: nn.Module) -> Iterator[None]:
     finally:
         for part, training in modes:
             part.training = training
-
-
-def with_class(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a model's config that names its class, as those of 0.1.0 do not."""
-    return {"class": "GaussianWorldModel", **config}
-
-
-def _jsonable(key: Any) -> Any:
-    return list(key) if isinstance(key, tuple) else key
-
-
-def _key(key: Any) -> Any:
-    return tuple(key) if isinstance(key, list) else key
-
-
-def _checked_widths(
-    layout: EntityLayout, widths: Mapping[str, int] | None
-) -> dict[str, int]:
-    if layout.is_flat:
-        own = layout.widths()
-        if widths is not None and dict(widths) != own:
-            raise ValueError(
-                f"widths are {dict(widths)}, but the layout's columns make {own}: "
-                "leave widths out for a flat layout"
-            )
-        return own
-    if widths is None:
-        raise ValueError(
-            "the features of a nested layout are counted in the data: pass "
-            "widths=layout.widths(td) with an example tensordict"
-        )
-    if set(widths) != set(layout.names):
-        raise ValueError(
-            f"widths name {sorted(widths)}, but the layout has {list(layout.names)}"
-        )
-    for name, width in widths.items():
-        if not isinstance(width, int) or width < 1:
-            raise ValueError(
-                f"the width of entity {name!r} must be an int of at least 1, got "
-                f"{width!r}"
-            )
-    return {name: widths[name] for name in layout.names}
-
-
-def _checked_predict(
-    layout: EntityLayout,
-    widths: Mapping[str, int],
-    predict: Mapping[str, Iterable[int]] | None,
-) -> dict[str, tuple[int, ...]]:
-    """The positions to predict in each entity's features, in layout order."""
-    predict = {} if predict is None else predict
-    unknown = [name for name in predict if name not in layout.names]
-    if unknown:
-        raise ValueError(
-            f"predict names {unknown}, which are no entities of this layout: it has "
-            f"{list(layout.names)}"
-        )
-    positions: dict[str, tuple[int, ...]] = {}
-    for name in layout.names:
-        own = layout.columns[name] if layout.is_flat else tuple(range(widths[name]))
-        columns = tuple(predict.get(name, own))
-        foreign = [column for column in columns if column not in own]
-        if foreign or len(set(columns)) != len(columns):
-            what = f"{foreign}, which it does not own" if foreign else f"{columns}"
-            raise ValueError(
-                f"predict gives entity {name!r} the columns {what}: name each of its "
-                f"columns {list(own)} at most once"
-            )
-        positions[name] = tuple(own.index(column) for column in columns)
-    if not any(positions.values()):
-        raise ValueError("predict leaves nothing to predict: give it some columns")
-    return positions
-
-
-def _checked_floor(
-    floor: float | Mapping[str, float | Sequence[float]],
-    predict: Mapping[str, tuple[int, ...]],
-) -> list[float]:
-    if isinstance(floor, Mapping):
-        wanted = [name for name, positions in predict.items() if positions]
-        if set(floor) - set(predict) or set(wanted) - set(floor):
-            raise ValueError(
-                f"variance_floor names {sorted(floor)}, but the predicted entities are "
-                f"{wanted}: give each its own floor, or one float for all"
-            )
-        per_entity = {name: floor[name] for name in wanted}
-    else:
-        per_entity = {name: floor for name, positions in predict.items() if positions}
-    floors: list[float] = []
-    for name, value in per_entity.items():
-        count = len(predict[name])
-        values = list(value) if isinstance(value, Sequence) else [value] * count
-        if len(values) != count or any(not 0 <= v < float("inf") for v in values):
-            raise ValueError(
-                f"variance_floor of entity {name!r} is {value!r}, wanted a standard "
-                "deviation in physical units, not negative, or one for each of its "
-                f"{count} predicted columns"
-            )
-        floors += [float(v) for v in values]
-    return floors

@@ -1,4 +1,4 @@
-"""Linear layers by the quicker of two libraries on a CPU."""
+"""Linear layers with the faster of two libraries on a CPU."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from torchrl_caiac._torchrl import linear_pointwise
 
 __all__ = ["linear"]
 
-# Multiply-adds below which the larger overhead of a call outweighs the quicker kernel.
+# Multiply-adds below which the overhead of a call outweighs the faster kernel.
 _SMALL = 2**20
 
 
 def linear(value: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
-    """``value @ weight.T + bias``, and of that the positive part if wanted.
+    """Returns ``value @ weight.T + bias``, or its positive part.
 
-    On CPUs torch leaves float32 products to MKL, which uses half the width of an AMD
-    processor's AVX-512 units. oneDNN, torch's library for bfloat16, uses all of it, in
-    the same precision: large float32 products go there.
+    On CPUs torch computes float32 products with MKL, which uses half the width of an
+    AMD processor's AVX-512 units. oneDNN, torch's library for bfloat16, uses the full
+    width in the same precision, so it computes large float32 products here.
 
     Args:
-        value (torch.Tensor): ``[*B, I]``.
-        weight (torch.Tensor): ``[O, I]``.
-        bias (torch.Tensor): ``[O]``.
+        value (torch.Tensor): the input, ``[*B, I]``.
+        weight (torch.Tensor): the weight, ``[O, I]``.
+        bias (torch.Tensor): the bias, ``[O]``.
         relu (bool): whether to take the positive part. Defaults to ``False``.
 
     Returns:
@@ -48,18 +48,19 @@ def linear(value: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> T
 
 
 def _onednn(*operands: Tensor) -> bool:
-    """Whether oneDNN is there, and has a kernel that MKL may lack."""
+    """Returns whether oneDNN is available and may be faster than MKL."""
     return (
-        all(x.device.type == "cpu" and x.dtype == torch.float32 for x in operands)
+        # First: the compiler chooses its own kernels, and cannot trace the others.
+        not torch.compiler.is_compiling()
+        and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in operands)
         and torch.backends.mkldnn.is_available()
         and torch.backends.cpu.get_cpu_capability() == "AVX512"
         and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()  # inductor chooses its own kernels
     )
 
 
 class _Linear(torch.autograd.Function):
-    """oneDNN's product of rows ``[B, I]``, with gradients and :func:`torch.vmap`."""
+    """The product of oneDNN for ``[B, I]``, with gradients and :func:`torch.vmap`."""
 
     @staticmethod
     def forward(

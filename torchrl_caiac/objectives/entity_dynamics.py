@@ -1,4 +1,4 @@
-"""The loss that fits a world model to transitions."""
+"""The loss of world models."""
 
 from __future__ import annotations
 
@@ -23,35 +23,40 @@ __all__ = ["EntityDynamicsLoss", "gaussian_nll"]
 
 
 class EntityDynamicsLoss(LossModule):
-    """Negative log likelihood of the next state of every entity (paper, A.7).
+    """The negative log likelihood of the next state of every entity (paper, A.7).
 
     The targets are those of the model (normalised changes by default), so call
-    ``model.fit_statistics(data)`` first; :func:`fit_world_model` does. The state's keys
-    are those of the model's layout.
+    ``model.fit_statistics(data)`` first, as :func:`~torchrl_caiac.fit.fit_world_model`
+    does. The keys of the states are those of the model's layout.
 
     Args:
-        model (EntityDynamicsModel): the model to fit. A
-            :class:`~torchrl_caiac.modules.TransformerWorldModel` has the likelihood of
-            a Gaussian of unit variance, up to a constant: half the squared error.
+        model (EntityDynamicsModel): the model to fit. The likelihood of a
+            :class:`~torchrl_caiac.modules.TransformerWorldModel` is that of a Gaussian
+            of unit variance, up to a constant: half the squared error.
 
     Keyword Args:
-        functional (bool): keep the parameters in a
-            :class:`~tensordict.nn.TensorDictParams` of the loss, as TorchRL's losses
-            do; else hold the model as a submodule. They are the model's own parameters
-            in both cases. Defaults to ``True``.
-        reduction (str): ``"mean"``, ``"sum"`` or ``"none"`` over the rows. Defaults to
-            ``"mean"``. Rows that ``loss_mask_key`` masks do not count.
+        functional (bool): whether the loss keeps the parameters in a
+            :class:`~tensordict.nn.TensorDictParams`, as TorchRL's losses do, or has the
+            model as a submodule. Both are the model's own parameters. Defaults to
+            ``True``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"`` over the transitions, those
+            under the ``loss_mask_key`` of :class:`~torchrl.objectives.LossModule`
+            excepted. Defaults to ``"mean"``.
 
     Returns:
-        TensorDict: ``"loss_nll"``, nats per predicted column, and ``"mse"``, the
+        TensorDict: ``"loss_nll"``, in nats per predicted column, and ``"mse"``, the
         squared error of the normalised targets, detached.
+
+    Raises:
+        TypeError: the model is no world model.
+        ValueError: the reduction is unknown.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_caiac import EntityLayout
-        >>> from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
-        >>> from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss
+        >>> from torchrl_caiac.modules import GaussianWorldModel
+        >>> from torchrl_caiac.objectives import EntityDynamicsLoss
         >>> layout = EntityLayout({"arm": [0, 1], "cup": [2]})
         >>> td = TensorDict(
         ...     {
@@ -96,11 +101,13 @@ class EntityDynamicsLoss(LossModule):
     ) -> None:
         if not isinstance(model, EntityDynamicsModel):
             raise TypeError(
-                "the loss takes a TransformerWorldModel or a GaussianWorldModel, got "
+                "expected an EntityDynamicsModel, such as a GaussianWorldModel, got "
                 f"{type(model).__name__}"
             )
         if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f"reduction is 'mean', 'sum' or 'none', got {reduction!r}")
+            raise ValueError(
+                f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}"
+            )
         self._functional = functional
         super().__init__()
         if functional:
@@ -113,34 +120,38 @@ class EntityDynamicsLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """Whether the parameters are held apart from the model."""
+        """Whether the loss keeps the parameters outside of the model."""
         return self._functional
 
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        self._in_keys = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The states, the action and the next states."""
+    def _set_in_keys(self) -> None:
         layout = self.model.layout
-        return [
+        self._in_keys = [
             *layout.in_keys,
             self.tensor_keys.action,
             *(layout.next(key) for key in layout.in_keys),
         ]
 
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The states, the action and the next states."""
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
     def train(self, mode: bool = True) -> EntityDynamicsLoss:
-        """Sets the mode of the loss and of its model (its running normalisation)."""
+        """Sets the mode of the loss and of its model."""
         super().train(mode)
         self.model.train(mode)
         return self
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss of transitions.
+        """Computes the loss of transitions.
 
         Args:
-            tensordict (TensorDictBase): transitions ``[*B]``; left as they are.
+            tensordict (TensorDictBase): transitions ``[*B]``, not changed.
 
         Returns:
             TensorDictBase: ``"loss_nll"`` and ``"mse"``.
@@ -167,16 +178,16 @@ class EntityDynamicsLoss(LossModule):
 
     @torch.no_grad()
     def entity_mse(self, tensordict: TensorDictBase) -> TensorDict:
-        """The mean squared error of every entity's predicted next state.
+        """Returns the mean squared error of the predicted next state of every entity.
 
-        The model is put in evaluation mode meanwhile.
+        The model predicts in evaluation mode.
 
         Args:
             tensordict (TensorDictBase): transitions ``[*B]``.
 
         Returns:
-            TensorDict: per predicted entity a float ``[]``, in squared physical units,
-            mean over rows and the entity's predicted columns.
+            TensorDict: a float ``[]`` for each predicted entity, in squared physical
+            units, the mean over the transitions and the entity's predicted columns.
         """
         model, layout = self.model, self.model.layout
         with evaluating(model), self._parameters_in():

@@ -1,4 +1,4 @@
-"""TD3 for goals: own goal at the next step, bounded targets, cloning if wanted."""
+"""TD3 with goals, bounded targets and optional behaviour cloning."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.objectives import TD3Loss
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import priority_weight, reduce_loss, vmap_loss
 from torchrl_caiac.modules.goal_features import read_leaves
 from torchrl_caiac.modules.goal_networks import takes_params
@@ -24,69 +25,68 @@ __all__ = ["GoalConditionedTD3Loss"]
 class GoalConditionedTD3Loss(TD3Loss):
     """TorchRL's TD3 loss for goal-conditioned, offline and relabelled data.
 
-    It differs from :class:`~torchrl.objectives.TD3Loss` in this (paper, A.5.2):
+    It differs from :class:`~torchrl.objectives.TD3Loss` as follows (paper, A.5.2):
 
-    - The next state is judged by the goal of its own row. A relabelled batch lacks
-      ``("next", "desired_goal")``, or holds the goal from before the relabelling;
-      it is never read. A missing next state raises instead of being taken for the
-      current one.
-    - Targets are clamped to what a return can be, as in Hindsight Experience Replay:
-      rewards in ``reward_bounds`` give returns in those bounds over ``1 - γ``.
-    - Values are bootstrapped unless ``("next", "terminated")`` is True. That leaf must
-      be there: the end of an episode by its time limit is no end of the task.
-    - The policy's loss may have a penalty on actions and a behaviour cloning term
+    - The next state is evaluated with the goal of its own transition.
+      ``("next", "desired_goal")`` is never read: a relabelled batch lacks it, or has
+      the goal from before the relabelling. A missing next state raises an error.
+    - Targets are clamped to the range of possible returns, as in Hindsight Experience
+      Replay: rewards in ``reward_bounds`` give returns in those bounds over ``1 - γ``.
+    - ``("next", "terminated")`` is required, and values are bootstrapped unless it is
+      true: the time limit of an episode does not end the task.
+    - The loss of the policy may have a penalty on actions and a behaviour cloning term
       (TD3+BC, Fujimoto & Gu 2021): ``-λ Q(s, g, π) + |π - a|² / A`` with
-      ``λ = bc_alpha / mean |Q|``, and rows can be left out of the latter:
-      counterfactual rows hold the expert's action for what it did before the swap.
-    - The policy's loss evaluates the first critic only.
-    - The networks of this package are called with the loss's parameters, those of all
-      critics at once, which takes a fifth of the time off a step. ``deactivate_vmap``
-      is for other networks, whose parameters are swapped in and out as in TorchRL.
+      ``λ = bc_alpha / mean |Q|``. Transitions can be left out of the latter:
+      counterfactual ones contain the action of the expert before the swap.
+    - The loss of the policy evaluates the first critic only.
+    - The networks of this package are called with the parameters of the loss, those of
+      all critics at once, which takes a fifth of the time off a step. Parameters of
+      other networks are swapped in and out as in TorchRL, with ``deactivate_vmap``.
 
-    Everything else, :meth:`make_value_estimator` with the discount, ``set_keys`` and
-    :class:`~torchrl.objectives.SoftUpdate` among it, works as in TorchRL.
+    Everything else, such as :meth:`make_value_estimator` with the discount,
+    ``set_keys`` and :class:`~torchrl.objectives.SoftUpdate`, is as in TorchRL.
 
     Args:
-        actor_network (TensorDictModule): ``π(s, g)``, such as
+        actor_network (TensorDictModule): the policy ``π(s, g)``, such as a
             :class:`~torchrl_caiac.modules.GoalConditionedActor`.
-        qvalue_network (TensorDictModule or list of it): ``Q(s, g, a)``. A list with one
-            module per critic keeps their weights; of a single one TorchRL makes
-            copies with uniformly drawn weights.
+        qvalue_network (TensorDictModule or list of TensorDictModule): the critic
+            ``Q(s, g, a)``. With a list of one module for each critic, their weights are
+            kept; of a single one TorchRL makes copies with newly drawn weights.
 
     Keyword Args:
         bounds (tuple of float, optional): the bounds of the actions. Defaults to
-            ``(-1.0, 1.0)`` where ``action_spec`` is not given.
+            ``(-1.0, 1.0)`` if there is no ``action_spec``.
         action_spec (TensorSpec, optional): the bounds as a spec, instead of ``bounds``.
-        num_qvalue_nets (int): the number of critics; a list says it itself. Defaults
-            to 2.
-        reward_bounds (pair of float, optional): the least and the largest reward, from
-            which the bounds of the targets follow. Defaults to ``(-1.0, 0.0)``.
-        target_bounds (pair of float, optional): the bounds of the targets themselves,
-            instead of ``reward_bounds``. Targets are not clamped if both are ``None``.
-        action_penalty (float): weight of the policy's mean squared action. Defaults to
-            0.0.
-        bc_alpha (float, optional): the weight of the value against the behaviour
-            cloning term (TD3+BC: 2.5). ``None``, the default, leaves the term out.
-        bc_mask_key (NestedKey, optional): rows in which this bool leaf, ``[*B]`` or
-            ``[*B, 1]``, is True are left out of the behaviour cloning term, such as
-            ``("caiac", "counterfactual")``.
-        policy_noise (float): deviation of the noise on the target policy's action, in
-            units of the action. Defaults to 0.2.
-        noise_clip (float): the largest such noise. Defaults to 0.5.
+        num_qvalue_nets (int): the number of critics, unless they are a list. Defaults
+            to ``2``.
+        reward_bounds (tuple of float, optional): the smallest and the largest reward,
+            which determine the bounds of the targets. Defaults to ``(-1.0, 0.0)``.
+        target_bounds (tuple of float, optional): the bounds of the targets, instead of
+            ``reward_bounds``. Targets are not clamped if both are ``None``.
+        action_penalty (float): the weight of the policy's mean squared action. Defaults
+            to ``0.0``.
+        bc_alpha (float, optional): the weight of the value relative to the behaviour
+            cloning term (TD3+BC: 2.5). Defaults to ``None``: no such term.
+        bc_mask_key (NestedKey, optional): a bool leaf, ``[*B]`` or ``[*B, 1]``, true
+            for the transitions to leave out of the behaviour cloning term, such as
+            ``("caiac", "counterfactual")``. Defaults to ``None``: all count.
+        policy_noise (float): the standard deviation of the noise on the action of the
+            target policy, in units of the action. Defaults to ``0.2``.
+        noise_clip (float): the largest such noise. Defaults to ``0.5``.
         loss_function (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``. Defaults to
-            ``"l2"`` (TD3's own).
+            ``"l2"``, as in TD3.
         **kwargs: further arguments of :class:`~torchrl.objectives.TD3Loss`, such as
             ``reduction`` (``"mean"``, ``"sum"`` or ``"none"``).
 
     Returns:
-        TensorDict: ``"loss_actor"`` and ``"loss_qvalue"`` (the sum over critics), and
-        detached, per row, ``"pred_value"`` (``[C, *B]`` for ``C`` critics),
+        TensorDict: ``"loss_actor"`` and ``"loss_qvalue"`` (the sum over critics); and
+        detached, for each transition, ``"pred_value"`` (``[C, *B]`` for ``C`` critics),
         ``"state_action_value_actor"``, ``"next_state_value"`` and ``"target_value"``
-        (``[*B]``); with ``bc_alpha`` the scalars ``"bc_loss"`` and ``"lmbd"`` too.
+        (``[*B]``); with ``bc_alpha`` also the scalars ``"bc_loss"`` and ``"lmbd"``.
 
     Raises:
         ValueError: bounds are given twice or out of order, a weight is negative, or
-            ``bc_mask_key`` is given without ``bc_alpha``.
+            there is a ``bc_mask_key`` without ``bc_alpha``.
 
     Examples:
         >>> import torch
@@ -133,8 +133,8 @@ class GoalConditionedTD3Loss(TD3Loss):
         """The keys that ``set_keys`` accepts: those of TD3Loss and the goal.
 
         Attributes:
-            desired_goal (NestedKey): the goal of a row, ``[*B, G]``, an input of the
-                networks. Defaults to ``"desired_goal"``.
+            desired_goal (NestedKey): the goal, ``[*B, G]``, an input of the networks.
+                Defaults to ``"desired_goal"``.
         """
 
         desired_goal: NestedKey = "desired_goal"
@@ -171,7 +171,7 @@ class GoalConditionedTD3Loss(TD3Loss):
         if target_bounds is not None:
             if reward_bounds not in (None, (-1.0, 0.0)):
                 raise ValueError(
-                    f"targets are bounded by target_bounds={target_bounds!r} or by "
+                    f"got target_bounds={target_bounds!r} and "
                     f"reward_bounds={reward_bounds!r}: give one of them"
                 )
             reward_bounds = None
@@ -180,14 +180,14 @@ class GoalConditionedTD3Loss(TD3Loss):
             ("target_bounds", target_bounds),
         ):
             if pair is not None and not pair[0] < pair[1]:
-                raise ValueError(f"{name} is a pair (low, high), got {pair!r}")
+                raise ValueError(f"{name} must be a pair (low, high), got {pair!r}")
         if not action_penalty >= 0.0:
             raise ValueError(f"action_penalty must be at least 0, got {action_penalty}")
         if bc_alpha is not None and not bc_alpha >= 0.0:
             raise ValueError(f"bc_alpha must be at least 0 or None, got {bc_alpha}")
         if bc_mask_key is not None and bc_alpha is None:
             raise ValueError(
-                f"bc_mask_key={bc_mask_key!r} masks the behaviour cloning term, which "
+                f"bc_mask_key={bc_mask_key!r} is for the behaviour cloning term, which "
                 "bc_alpha=None leaves out: give bc_alpha"
             )
         if isinstance(qvalue_network, Sequence):
@@ -209,7 +209,7 @@ class GoalConditionedTD3Loss(TD3Loss):
         self._target_bounds = target_bounds
         self.action_penalty = action_penalty
         self.bc_alpha = bc_alpha
-        self.bc_mask_key = None if bc_mask_key is None else unravel_key(bc_mask_key)
+        self.bc_mask_key = None if bc_mask_key is None else as_key(bc_mask_key)
         if bc_alpha is not None:
             self.out_keys = [*self.out_keys, "bc_loss", "lmbd"]
 
@@ -219,7 +219,7 @@ class GoalConditionedTD3Loss(TD3Loss):
         keys = self.tensor_keys
         self._in_keys = list(
             dict.fromkeys(
-                unravel_key(key)
+                as_key(key)
                 for key in (
                     keys.action,
                     *self._state_keys,
@@ -234,53 +234,55 @@ class GoalConditionedTD3Loss(TD3Loss):
 
     @property
     def _state_keys(self) -> list[NestedKey]:
-        """What the networks read but the action."""
+        """The inputs of the networks without the action."""
         inputs = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
         keys = [key for key in dict.fromkeys(inputs) if key != self.tensor_keys.action]
         if not any(map(self._goal, keys)):
             raise ValueError(
-                f"the networks read {keys}, and the goal "
-                f"{self.tensor_keys.desired_goal!r} is not among them: name its key "
-                "with set_keys(desired_goal=...)"
+                f"the networks read {keys}, but not the goal "
+                f"{self.tensor_keys.desired_goal!r}: name its key with "
+                "set_keys(desired_goal=...)"
             )
         return keys
 
     def _goal(self, key: NestedKey) -> bool:
-        return unravel_key(key) == unravel_key(self.tensor_keys.desired_goal)
+        return as_key(key) == as_key(self.tensor_keys.desired_goal)
 
     # --- targets -----------------------------------------------------------------
 
     def make_value_estimator(
         self, value_type: Any = None, **hyperparams: Any
     ) -> GoalConditionedTD3Loss:
-        """Chooses the estimator of the targets, as in TorchRL.
+        """Sets the estimator of the targets, as in TorchRL.
 
         Args:
             value_type (ValueEstimators, ValueEstimatorBase or type, optional): the
                 estimator, its kind, or its class. Defaults to ``ValueEstimators.TD0``.
-            **hyperparams: of the estimator, such as ``gamma``, by default 0.99.
+            **hyperparams: arguments of the estimator, such as ``gamma``, which defaults
+                to ``0.99``.
 
         Returns:
             GoalConditionedTD3Loss: the loss itself.
 
         Raises:
-            ValueError: the targets' bounds follow from those of the rewards, but
-                ``gamma`` is not below 1.
+            ValueError: ``gamma`` is not below 1, so that rewards in ``reward_bounds``
+                give unbounded targets.
         """
         super().make_value_estimator(value_type, **hyperparams)
-        # An estimator that was passed in has default keys until it is told.
-        self._forward_value_estimator_keys()
+        # Passes the keys of the loss to an estimator that was given as an object.
+        self.set_keys()
         gamma = float(self.value_estimator.gamma)
         if self.reward_bounds is not None and not gamma < 1.0:
             raise ValueError(
-                f"gamma is {gamma}, and returns of rewards within {self.reward_bounds} "
-                "have no bounds: give target_bounds, or reward_bounds=None"
+                f"gamma is {gamma}, expected less than 1, else returns of rewards in "
+                f"{self.reward_bounds} are unbounded: give target_bounds, or "
+                "reward_bounds=None"
             )
         return self
 
     @property
     def target_bounds(self) -> tuple[Any, Any] | None:
-        """What the targets are clamped to, ``None`` if they are not."""
+        """The bounds of the targets, ``None`` if they are not clamped."""
         if self.reward_bounds is None:
             return self._target_bounds
         low, high = self.reward_bounds
@@ -292,20 +294,21 @@ class GoalConditionedTD3Loss(TD3Loss):
     def actor_loss(
         self, tensordict: TensorDictBase
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The policy's loss; the critics get no gradient.
+        """Computes the loss of the policy, without gradients for the critics.
 
         Args:
-            tensordict (TensorDictBase): transitions ``[*B]``; left as they are.
+            tensordict (TensorDictBase): transitions ``[*B]``, not changed.
 
         Returns:
-            tuple: the loss, and detached ``"state_action_value_actor"`` ``[*B]`` and,
-            with ``bc_alpha``, the scalars ``"bc_loss"`` and ``"lmbd"``.
+            tuple of torch.Tensor and dict: the loss; and detached
+            ``"state_action_value_actor"`` ``[*B]`` and, with ``bc_alpha``, the scalars
+            ``"bc_loss"`` and ``"lmbd"``.
         """
         weights = priority_weight(self, tensordict)
         inputs = self._inputs(tensordict, self._state_keys)
         inputs = _call(self.actor_network, inputs, self.actor_network_params)
         action = inputs.get(self.tensor_keys.action)
-        # Not detach(): tensordict caches it, and it would miss a change of dtype.
+        # Not detach(): tensordict caches it, and the cache outlasts a change of dtype.
         critic = self.qvalue_network_params.data[0]
         inputs = _call(self.qvalue_network, inputs, critic)
         value = inputs.get(self.tensor_keys.state_action_value).squeeze(-1)
@@ -327,14 +330,15 @@ class GoalConditionedTD3Loss(TD3Loss):
     def value_loss(
         self, tensordict: TensorDictBase
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The critics' loss; the policy gets no gradient.
+        """Computes the loss of the critics, without gradients for the policy.
 
         Args:
-            tensordict (TensorDictBase): transitions ``[*B]``; left as they are.
+            tensordict (TensorDictBase): transitions ``[*B]``, not changed.
 
         Returns:
-            tuple: the loss, and detached ``"td_error"`` and ``"pred_value"``
-            ``[C, *B]``, ``"next_state_value"`` and ``"target_value"`` ``[*B]``.
+            tuple of torch.Tensor and dict: the loss; and detached ``"td_error"`` and
+            ``"pred_value"`` ``[C, *B]``, ``"next_state_value"`` and ``"target_value"``
+            ``[*B]``.
         """
         keys = self.tensor_keys
         weights = priority_weight(self, tensordict)
@@ -367,7 +371,7 @@ class GoalConditionedTD3Loss(TD3Loss):
 
     def _make_vmap(self) -> None:
         super()._make_vmap()
-        # The critics share their input, so that only their weights are mapped over.
+        # All critics have the same input: only their weights are mapped over.
         self._vmap_qvalue_networkN0 = vmap_loss(
             self.qvalue_network,
             (None, 0),
@@ -376,7 +380,7 @@ class GoalConditionedTD3Loss(TD3Loss):
         )
 
     def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> torch.Tensor:
-        """Values of all critics, ``[C, *B]``."""
+        """Returns the values of all critics, ``[C, *B]``."""
         if takes_params(self.qvalue_network):
             inputs = inputs.expand(self.num_qvalue_nets, *inputs.batch_size)
             out = self.qvalue_network(inputs, params)
@@ -393,7 +397,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             shape = read_leaves(tensordict, [("next", name)])[0].shape
             if shape != (*next_value.shape, 1):
                 raise ValueError(
-                    f"{('next', name)!r} has the shape {list(shape)}, wanted "
+                    f"{('next', name)!r} has the shape {list(shape)}, expected "
                     f"{[*next_value.shape, 1]}"
                 )
         target: torch.Tensor = self.value_estimator.value_estimate(
@@ -405,7 +409,7 @@ class GoalConditionedTD3Loss(TD3Loss):
     def _cloning_error(
         self, action: torch.Tensor, tensordict: TensorDictBase
     ) -> torch.Tensor:
-        """The squared error of the actions, ``[*B]``; its mean is that of kept rows."""
+        """Returns errors ``[*B]``, whose mean is that over unmasked transitions."""
         (expert,) = read_leaves(tensordict, [self.tensor_keys.action])
         error = (action - expert).square().mean(-1)
         if self.bc_mask_key is None:
@@ -413,9 +417,9 @@ class GoalConditionedTD3Loss(TD3Loss):
         (masked,) = read_leaves(tensordict, [self.bc_mask_key])
         if masked.dtype != torch.bool or masked.numel() != error.numel():
             raise ValueError(
-                f"{self.bc_mask_key!r} has the shape {list(masked.shape)} and dtype "
-                f"{masked.dtype}, wanted a bool {[*error.shape, 1]}, True in rows "
-                "that are not cloned"
+                f"{self.bc_mask_key!r} is {masked.dtype} of the shape "
+                f"{list(masked.shape)}, expected bool {[*error.shape, 1]}, true for "
+                "transitions to leave out"
             )
         kept = ~masked.reshape(error.shape)
         error = error.where(kept, torch.zeros_like(error))
@@ -430,7 +434,7 @@ class GoalConditionedTD3Loss(TD3Loss):
         *,
         after: bool = False,
     ) -> TensorDict:
-        """The networks' inputs, of the next state if ``after``, with the row's goal."""
+        """Returns the inputs of the networks, of the next state if ``after``."""
         sources = [
             ("next", key) if after and not self._goal(key) else key for key in keys
         ]
@@ -444,7 +448,7 @@ class GoalConditionedTD3Loss(TD3Loss):
 def _call(
     network: TensorDictModule, inputs: TensorDictBase, params: TensorDictBase
 ) -> TensorDictBase:
-    """Calls a network with the parameters that the loss holds."""
+    """Calls a network with parameters of the loss."""
     if takes_params(network):
         return network(inputs, params)
     with params.to_module(network, preserve_module_state=False):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -166,6 +166,12 @@ class LMPLoss(LossModule):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
+    out_keys: ClassVar[list[NestedKey]] = [
+        "loss_reconstruction",
+        "loss_kl",
+        "kl",
+        "mse",
+    ]
     _schedulable_buffers = frozenset(
         {"kl_weight", "kl_balance", "reconstruction_weight"}
     )
@@ -197,8 +203,6 @@ class LMPLoss(LossModule):
             raise ValueError(
                 f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}"
             )
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[NestedKey] | None = None
         super().__init__()
         self.model = model
         self.register_buffer("kl_weight", torch.tensor(float(kl_weight)))
@@ -220,31 +224,18 @@ class LMPLoss(LossModule):
         """``False``: the model keeps its parameters."""
         return False
 
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        self._in_keys = None
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        self._in_keys = [keys.observation, keys.action, keys.desired_goal]
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """The required leaves, without the optional mask."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            self._in_keys = [keys.observation, keys.action, keys.desired_goal]
         return self._in_keys
 
     @in_keys.setter
-    def in_keys(self, value: list[NestedKey]) -> None:
-        self._in_keys = value
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """The losses, then the detached values for logging."""
-        if self._out_keys is None:
-            self._out_keys = ["loss_reconstruction", "loss_kl", "kl", "mse"]
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, value: list[NestedKey]) -> None:
-        self._out_keys = value
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,0 +1,152 @@
+"""Checks of the arguments that say which columns a world model predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from torchrl_caiac.entities import EntityLayout
+
+__all__ = ["checked_floor", "checked_predict", "checked_widths"]
+
+
+def checked_widths(
+    layout: EntityLayout, widths: Mapping[str, int] | None
+) -> dict[str, int]:
+    """Returns the number of features of each entity, in layout order.
+
+    Args:
+        layout (EntityLayout): the entities.
+        widths (Mapping of str to int, optional): the argument of the model.
+
+    Returns:
+        dict of str to int: one number for each entity.
+
+    Raises:
+        ValueError: the widths do not fit the layout.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules._predicted_columns import checked_widths
+        >>> checked_widths(EntityLayout({"arm": [0, 1], "cup": [2]}), None)
+        {'arm': 2, 'cup': 1}
+    """
+    if layout.is_flat:
+        own = layout.widths()
+        if widths is not None and dict(widths) != own:
+            raise ValueError(
+                f"widths are {dict(widths)}, expected {own}: leave widths out for a "
+                "flat layout"
+            )
+        return own
+    if widths is None:
+        raise ValueError(
+            "a nested layout does not know the number of features: pass "
+            "widths=layout.widths(td) with an example tensordict"
+        )
+    if set(widths) != set(layout.names):
+        raise ValueError(
+            f"widths are of {sorted(widths)}, expected those of {list(layout.names)}"
+        )
+    for name, width in widths.items():
+        if not isinstance(width, int) or width < 1:
+            raise ValueError(
+                f"the width of entity {name!r} must be an int of at least 1, got "
+                f"{width!r}"
+            )
+    return {name: widths[name] for name in layout.names}
+
+
+def checked_predict(
+    layout: EntityLayout,
+    widths: Mapping[str, int],
+    predict: Mapping[str, Iterable[int]] | None,
+) -> dict[str, tuple[int, ...]]:
+    """Returns the positions to predict in the features of each entity.
+
+    Args:
+        layout (EntityLayout): the entities.
+        widths (Mapping of str to int): the number of features of each entity.
+        predict (Mapping of str to iterable of int, optional): the argument of the
+            model.
+
+    Returns:
+        dict of str to tuple of int: one tuple for each entity, in layout order.
+
+    Raises:
+        ValueError: a column is not the entity's, is given twice, or none is left.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules._predicted_columns import checked_predict
+        >>> layout = EntityLayout({"arm": [0, 1], "cup": [2, 3]})
+        >>> checked_predict(layout, layout.widths(), {"cup": [3]})
+        {'arm': (0, 1), 'cup': (1,)}
+    """
+    predict = {} if predict is None else predict
+    unknown = [name for name in predict if name not in layout.names]
+    if unknown:
+        raise ValueError(
+            f"predict names {unknown}, which are no entities of this layout: expected "
+            f"some of {list(layout.names)}"
+        )
+    positions: dict[str, tuple[int, ...]] = {}
+    for name in layout.names:
+        own = layout.columns[name] if layout.is_flat else tuple(range(widths[name]))
+        columns = tuple(predict.get(name, own))
+        foreign = [column for column in columns if column not in own]
+        if foreign or len(set(columns)) != len(columns):
+            what = f"{foreign}, which it does not own" if foreign else f"{columns}"
+            raise ValueError(
+                f"predict gives entity {name!r} the columns {what}: name each of its "
+                f"columns {list(own)} at most once"
+            )
+        positions[name] = tuple(own.index(column) for column in columns)
+    if not any(positions.values()):
+        raise ValueError("predict leaves nothing to predict: give some columns")
+    return positions
+
+
+def checked_floor(
+    floor: float | Mapping[str, float | Sequence[float]],
+    predict: Mapping[str, tuple[int, ...]],
+) -> list[float]:
+    """Returns the variance floor of every predicted column.
+
+    Args:
+        floor (float or Mapping): the argument of the model.
+        predict (Mapping of str to tuple of int): the output of
+            :func:`checked_predict`.
+
+    Returns:
+        list of float: one standard deviation for each predicted column.
+
+    Raises:
+        ValueError: a floor is missing, negative or not finite.
+
+    Examples:
+        >>> from torchrl_caiac.modules._predicted_columns import checked_floor
+        >>> checked_floor({"arm": 0.1, "cup": [0.2, 0.3]}, {"arm": (0,), "cup": (0, 1)})
+        [0.1, 0.2, 0.3]
+    """
+    if isinstance(floor, Mapping):
+        wanted = [name for name, positions in predict.items() if positions]
+        if set(floor) - set(predict) or set(wanted) - set(floor):
+            raise ValueError(
+                f"variance_floor names {sorted(floor)}, expected the predicted "
+                f"entities {wanted}: give each its own floor, or one float for all"
+            )
+        per_entity = {name: floor[name] for name in wanted}
+    else:
+        per_entity = {name: floor for name, positions in predict.items() if positions}
+    floors: list[float] = []
+    for name, value in per_entity.items():
+        count = len(predict[name])
+        values = list(value) if isinstance(value, Sequence) else [value] * count
+        if len(values) != count or any(not 0 <= v < float("inf") for v in values):
+            raise ValueError(
+                f"variance_floor of entity {name!r} is {value!r}, expected a standard "
+                "deviation in physical units, at least 0, or one for each of its "
+                f"{count} predicted columns"
+            )
+        floors += [float(v) for v in values]
+    return floors
