@@ -169,7 +169,7 @@ def test_a_layer_without_attention_is_named() -> None:
 
     model, td = make().eval(), transitions(5)
     model.layers[1].self_attn = Blind(8, 2, batch_first=True)
-    with pytest.raises(RuntimeError, match="1 of 2 encoder layers gave their"):
+    with pytest.raises(RuntimeError, match="1 of 2 encoder layers returned their"):
         model.attention(LAYOUT.read(td), td["action"])
     model.layers = torch.nn.ModuleList()
     with pytest.raises(RuntimeError, match="0 of 0 encoder layers"):
@@ -237,9 +237,9 @@ def test_config_copies_and_pickles(layout: EntityLayout) -> None:
         ({"heads": 1.5}, "heads must be an int"),
         ({"width": True}, "width must be an int"),
         ({"feedforward": -1}, "feedforward must be an int"),
-        ({"heads": 3}, "3 heads do not divide the width 8"),
-        ({"dropout": 1.0}, r"dropout lies in \[0, 1\), got 1.0"),
-        ({"out_keys": ["a", "b"]}, "out_keys is one key"),
+        ({"heads": 3}, "width is 8, expected a multiple of the 3 heads"),
+        ({"dropout": 1.0}, r"dropout must be in \[0, 1\), got 1.0"),
+        ({"out_keys": ["a", "b"]}, "out_keys must be one key"),
         ({"target": "next"}, "'change' or 'absolute'"),
         ({"predict": {"pot": [1]}}, "no entities of this layout"),
     ],

@@ -846,6 +846,7 @@ def test_losses_of_a_gpu_are_those_of_the_cpu_and_wait_for_nothing(dtype):
     torch.testing.assert_close(found[1], found[0], **tolerance)
 
 
+@pytest.mark.slow
 def test_compiles_without_graph_breaks(monkeypatch):
     monkeypatch.setattr(linear, "_SMALL", 0)  # the choice of the library is traced too
     loss, data = make_loss(), make_batch(8)

@@ -1,4 +1,4 @@
-"""A Gaussian model of how every entity moves, for causal action influence."""
+"""The Gaussian world model, for causal action influence."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _LOG_2PI = math.log(2 * math.pi)
 def gaussian_nll(
     loc: torch.Tensor, var: torch.Tensor, target: torch.Tensor
 ) -> torch.Tensor:
-    """The negative log likelihood under diagonal Gaussians, mean over columns.
+    """Returns the negative log likelihood of diagonal Gaussians, mean over columns.
 
     Args:
-        loc (torch.Tensor): means ``[*B, P]``.
-        var (torch.Tensor): variances ``[*B, P]``.
-        target (torch.Tensor): ``[*B, P]``.
+        loc (torch.Tensor): the means, ``[*B, P]``.
+        var (torch.Tensor): the variances, ``[*B, P]``.
+        target (torch.Tensor): the targets, ``[*B, P]``.
 
     Returns:
-        torch.Tensor: nats per column, ``[*B]``.
+        torch.Tensor: in nats per column, ``[*B]``.
 
     Examples:
         >>> import torch
@@ -52,51 +52,50 @@ class GaussianWorldModel(EntityDynamicsModel):
     r"""The transition model ``p(s'_j | s, a)`` of the paper, section 3.2 and A.7.
 
     A multi-layer perceptron (ReLU, orthogonal weights, zero biases) reads the features
-    of all ``N`` entities (``W`` numbers, :meth:`EntityLayout.read`) and the action
-    (``A``), both normalised by a running mean and variance without affine parameters,
-    and gives a diagonal Gaussian of ``P`` predicted columns through separate heads for
-    the mean and the variance.
+    of all ``N`` entities (``W`` numbers, :meth:`~torchrl_caiac.EntityLayout.read`) and
+    the action (``A``), both normalised by a running mean and variance. Separate heads
+    predict the mean and the variance of a diagonal Gaussian of ``P`` columns.
 
     The Gaussian describes the *normalised target*: by default the change of each
-    column over the step, divided by its standard deviation in the data, or by the
-    floor where that is smaller. Causal action influence is a KL divergence and does
-    not change under such fixed affine maps of the target, so the scores are those of
-    the next state itself; learning, however, gets easy. The variance is
-    ``softplus(·) + 1e-8`` plus the square of ``variance_floor``, at most
-    ``max_variance`` (in normalised units). The floor is in physical units: without it
-    objects at rest get tiny variances, and the KL blows up a spurious dependence on
-    the action.
+    column over the step, divided by its standard deviation in the data, or by the floor
+    if that is larger. This makes learning easier. The scores do not change: causal
+    action influence is a KL divergence, which is invariant under a fixed affine map of
+    the target. The variance is ``softplus(·) + 1e-8`` plus the square of
+    ``variance_floor``, at most ``max_variance`` (in normalised units). Without the
+    floor, objects at rest get tiny variances, and the KL divergence amplifies a
+    spurious dependence on the action.
 
     Args:
         layout (EntityLayout): the entities.
         action_dim (int): the size ``A`` of the action.
         hidden_sizes (sequence of int): the widths of the hidden layers. Defaults to
-            three layers of 256.
-        predict (mapping of str to iterable of int, optional): the columns to predict of
-            some entities; the others are predicted whole. Flat layouts: observation
-            columns that the entity owns. Nested layouts: positions in the entity's
-            flattened features. ``()`` leaves an entity out (it then has no score).
+            ``(256, 256, 256)``.
+        predict (Mapping of str to iterable of int, optional): the columns to predict
+            of some entities, as in
+            :class:`~torchrl_caiac.modules.EntityDynamicsModel`. Defaults to all
+            columns.
 
     Keyword Args:
-        widths (mapping of str to int, optional): the features of each entity,
-            ``layout.widths(td)``. Needed by nested layouts only.
-        action_key (NestedKey): defaults to ``"action"``.
+        widths (Mapping of str to int, optional): the number of features of each
+            entity, ``layout.widths(td)``. Required for nested layouts only.
+        action_key (NestedKey): the action. Defaults to ``"action"``.
         out_keys (pair of NestedKey): where mean and variance are written, both
             ``[*B, P]``. Defaults to ``("prediction", "loc")`` and
             ``("prediction", "var")``.
-        target (str): ``"change"`` (next minus now) or ``"absolute"`` (the next state,
-            centred). Defaults to ``"change"``.
-        variance_floor (float or mapping): a standard deviation in physical units, at
-            least this much of which is always left to chance: one number, or per
-            entity one number or one for each predicted column. Defaults to ``1e-3``
-            (1 mm, 1 mrad).
-        spectral_norm (bool): normalise the hidden layers spectrally. Defaults to
-            ``False``.
+        target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
+            next state, centred). Defaults to ``"change"``.
+        variance_floor (float or Mapping): the smallest standard deviation, in physical
+            units, of the data and of a prediction. One number, or for each entity one
+            number or one for each predicted column. Defaults to ``1e-3`` (1 mm,
+            1 mrad).
+        spectral_norm (bool): whether to normalise the hidden layers spectrally.
+            Defaults to ``False``.
         max_variance (float): the largest variance, in normalised units. Defaults to
             ``200.0``.
 
     Attributes:
-        predicted (dict of str to slice): where each predicted entity lies in ``P``.
+        predicted (dict of str to slice): the position of each predicted entity in
+            ``P``.
 
     Raises:
         ValueError: an argument does not fit the layout.
@@ -144,14 +143,14 @@ class GaussianWorldModel(EntityDynamicsModel):
             not isinstance(size, int) or size < 1 for size in hidden_sizes
         ):
             raise ValueError(
-                "hidden_sizes names the width of at least one hidden layer, each an "
-                f"int of at least 1, got {hidden_sizes!r}"
+                "hidden_sizes must have the width of at least one hidden layer, each "
+                f"an int of at least 1, got {hidden_sizes!r}"
             )
         if not max_variance > 0:
             raise ValueError(f"max_variance must be positive, got {max_variance!r}")
         if len(tuple(out_keys)) != 2:
             raise ValueError(
-                f"out_keys are two keys, of mean and variance, got {out_keys!r}"
+                f"out_keys must be two keys, of mean and variance, got {out_keys!r}"
             )
         super().__init__(
             layout,
@@ -179,21 +178,20 @@ class GaussianWorldModel(EntityDynamicsModel):
     def forward_tensors(
         self, state: torch.Tensor, action: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The Gaussian of the normalised target, from tensors.
+        """Predicts the Gaussian of the normalised target from tensors.
 
-        Batch dimensions broadcast: a state ``[B, 1, W]`` and actions ``[1, K, A]`` give
-        ``[B, K, P]``, and what the first layer does with the state is done once for
-        all ``K`` actions.
+        Batch dimensions broadcast: states ``[B, 1, W]`` and actions ``[1, K, A]`` give
+        ``[B, K, P]``. The first layer multiplies each state once for all ``K`` actions.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
             action (torch.Tensor): ``[*B, A]``.
 
         Returns:
-            tuple of torch.Tensor: mean and variance, ``[*B, P]``.
+            tuple of torch.Tensor: mean and variance, ``[*B, P]`` each.
 
         Raises:
-            ValueError: a last dimension has another size.
+            ValueError: a last dimension has the wrong size.
         """
         self._check_widths(state, action)
         dtype = self.loc_head.weight.dtype
@@ -214,26 +212,27 @@ class GaussianWorldModel(EntityDynamicsModel):
     def for_actions(
         self, actions: torch.Tensor, *, rows: int = 1024
     ) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
-        """A function that predicts what the same actions do in many states.
+        """Returns a function that predicts the same actions in many states.
 
-        It gives what :meth:`forward_tensors` gives for states ``[B, 1, W]`` and actions
-        ``[1, K, A]`` in evaluation mode, without gradients, up to rounding. What does
-        not depend on the state is done here, once: the actions' part of the first
-        layer, and laying out the weights. Ask for another function when the model has
-        changed.
+        The function agrees with :meth:`forward_tensors` on states ``[B, 1, W]`` and
+        actions ``[1, K, A]`` in evaluation mode, up to rounding, and has no gradients.
+        Computations that do not depend on the state are done once: the actions' part of
+        the first layer, and the memory layout of the weights. Request a new function
+        when the model has changed.
 
         Args:
-            actions (torch.Tensor): ``[K, A]``.
+            actions (torch.Tensor): the actions, ``[K, A]``.
 
         Keyword Args:
-            rows (int): pairs of a state and an action that pass the network at once.
-                Defaults to 1024: their activations stay in a processor's cache.
+            rows (int): the number of pairs of a state and an action that pass the
+                network at once. Defaults to ``1024``: their activations stay in the
+                cache of the processor.
 
         Returns:
-            callable: maps states ``[B, W]`` to mean and variance, ``[B, K, P]``.
+            callable: maps states ``[B, W]`` to mean and variance, ``[B, K, P]`` each.
 
         Raises:
-            ValueError: a last dimension has another size.
+            ValueError: a last dimension has the wrong size.
 
         Examples:
             >>> import torch
@@ -271,7 +270,7 @@ class GaussianWorldModel(EntityDynamicsModel):
         def predict(state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             if state.shape[-1] != self.state_dim:
                 raise ValueError(
-                    f"states are [B, {self.state_dim}], got {list(state.shape)}"
+                    f"expected states [B, {self.state_dim}], got {list(state.shape)}"
                 )
             state = (state.to(dtype) - shift) * gain
             size = (len(state), num_actions, 2 * self.predict_dim)
@@ -299,21 +298,21 @@ class GaussianWorldModel(EntityDynamicsModel):
     def nll(
         self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
     ) -> torch.Tensor:
-        """The negative log likelihood of a target, :func:`gaussian_nll`.
+        """Returns the negative log likelihood of targets, see :func:`gaussian_nll`.
 
         Args:
             prediction (tuple of torch.Tensor): mean and variance, ``[*B, P]``.
             target (torch.Tensor): normalised targets ``[*B, P]``.
 
         Returns:
-            torch.Tensor: nats per column, ``[*B]``.
+            torch.Tensor: in nats per column, ``[*B]``.
         """
         loc, var = prediction
         return gaussian_nll(loc, var, target)
 
     @property
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model, and its class, JSON-compatible."""
+        """The class of the model and its arguments, JSON-compatible."""
         return {
             **super().config,
             "hidden_sizes": list(self.hidden_sizes),
@@ -331,15 +330,15 @@ def _orthogonal(layer: nn.Linear) -> nn.Linear:
 def _product(
     weight: torch.Tensor, bias: torch.Tensor, *, relu: bool
 ) -> Callable[[torch.Tensor], torch.Tensor]:
-    """A linear layer for inference, with or without ReLU."""
+    """Returns a linear layer for inference, with or without ReLU."""
     if (
         weight.device.type == "cpu"
         and weight.dtype == torch.float32
         and torch.backends.mkldnn.is_available()
         and torch.backends.mkldnn.enabled
     ):
-        # oneDNN, as torch.compile calls it. F.linear takes MKL for float32, which is
-        # half as fast on processors that are not Intel's.
+        # oneDNN, as torch.compile calls it. F.linear uses MKL for float32, which takes
+        # twice as long on other processors than Intel's.
         weight = packed_weight(weight.detach())
 
         def product(x: torch.Tensor) -> torch.Tensor:
@@ -355,7 +354,7 @@ def _product(
 
 
 def _softplus(x: torch.Tensor) -> torch.Tensor:
-    """``F.softplus``, whose log1p is not vectorised on CPUs."""
+    """Computes ``F.softplus``, whose ``log1p`` is not vectorised on CPUs."""
     y = x.abs().neg_().exp_()
     one_and_y = 1 + y
     lost = (y - (one_and_y - 1)).div_(one_and_y)  # by rounding

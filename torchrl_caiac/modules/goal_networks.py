@@ -10,10 +10,11 @@ from functools import cache
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.modules import MLP
 
+from torchrl_caiac._keys import as_key
 from torchrl_caiac.modules.goal_features import GoalFeatures, read_leaves
 from torchrl_caiac.modules.linear import linear
 
@@ -23,7 +24,7 @@ __all__ = ["GoalConditionedActor", "GoalConditionedCritic"]
 class _CastLinear(nn.Linear):
     """A linear layer that computes in one dtype and keeps its weights in another.
 
-    What ``torch.autocast`` does, but for chosen layers.
+    It is ``torch.autocast`` for single layers.
     """
 
     def __init__(
@@ -63,14 +64,14 @@ class _MLP(MLP):
     """An MLP that can be called with parameters that are not its own.
 
     Swapping them in and out of the modules would take a fifth of a training step.
-    Parameters of ``C`` networks, stacked, map ``[C, *B, I]`` to ``[C, *B, O]``.
+    Stacked parameters of ``C`` networks map ``[C, *B, I]`` to ``[C, *B, O]``.
     """
 
     def forward(
         self, value: torch.Tensor, params: TensorDictBase | None = None
     ) -> torch.Tensor:
         if params is not None and params.batch_dims and _on_cpu(value):
-            # Which gains nothing by batched products, and has no quick ones in float32.
+            # Batched products are no faster on a CPU, and slower in float32.
             networks = zip(value, params.unbind(0), strict=True)
             return torch.stack([self(one, own) for one, own in networks])
         for name, layer in self.named_children():
@@ -85,7 +86,7 @@ def _on_cpu(value: torch.Tensor) -> bool:
 
 @cache
 def _warn_without_bfloat16() -> None:
-    """Says once that this processor has no units for what was asked of it."""
+    """Warns once that bfloat16 is slow on this processor."""
     capabilities = torch.cpu.get_capabilities()
     if not any(known for name, known in capabilities.items() if "bf16" in name):
         warnings.warn(
@@ -108,19 +109,21 @@ def _mlp(
         not isinstance(size, int) or size < 1 for size in hidden_sizes
     ):
         raise ValueError(
-            "hidden_sizes names the width of at least one hidden layer, each an int of "
-            f"at least 1, got {hidden_sizes!r}"
+            "hidden_sizes must have the width of at least one hidden layer, each an "
+            f"int of at least 1, got {hidden_sizes!r}"
         )
     if hidden_dtype is not None and not hidden_dtype.is_floating_point:
-        raise ValueError(f"hidden_dtype is a floating point dtype, got {hidden_dtype}")
+        raise ValueError(
+            f"hidden_dtype must be a floating point dtype, got {hidden_dtype}"
+        )
     hidden = {"compute_dtype": hidden_dtype, "relu": True}
     return _MLP(
         in_features,
         out_features,
         num_cells=hidden_sizes,
-        activation_class=nn.Identity,  # the layers do it themselves
+        activation_class=nn.Identity,  # the layers apply ReLU themselves
         layer_class=_CastLinear,
-        # The last layer gives values and actions and keeps the dtype of the weights.
+        # The last layer computes values and actions, in the dtype of the weights.
         layer_kwargs=[*[hidden] * len(hidden_sizes), {}],
     )
 
@@ -129,7 +132,7 @@ class GoalConditionedActor(TensorDictModuleBase):
     """A deterministic policy ``π(s, g)``: features, a ReLU network, tanh.
 
     Args:
-        features (GoalFeatures): what the network reads. It is copied: fit its
+        features (GoalFeatures): the input of the network. It is copied: fit its
             statistics first.
         action_dim (int): the size ``A`` of the action.
         hidden_sizes (sequence of int): the widths of the hidden layers. Defaults to
@@ -137,19 +140,19 @@ class GoalConditionedActor(TensorDictModuleBase):
 
     Keyword Args:
         low (float or torch.Tensor): the smallest action, a number or ``[A]``. Defaults
-            to -1.
-        high (float or torch.Tensor): the largest action. Defaults to 1.
-        hidden_dtype (torch.dtype, optional): compute the hidden layers in this dtype
-            and keep the weights, their gradients and the last layer as they are.
-            ``torch.bfloat16`` halves the time of a step on CPUs that multiply it
-            natively. It rounds the features to two or three digits, so fit their
-            statistics: a raw position of a metre would be off by up to 4 mm.
-            ``None``, the default, computes all in the dtype of the weights.
+            to ``-1.0``.
+        high (float or torch.Tensor): the largest action, a number or ``[A]``. Defaults
+            to ``1.0``.
+        hidden_dtype (torch.dtype, optional): the dtype in which hidden layers compute.
+            Weights, gradients and the last layer keep theirs. ``torch.bfloat16`` halves
+            the time of a step on CPUs with native support. It rounds the features to
+            two or three digits, so fit their statistics: a raw position of 1 m would
+            be off by up to 4 mm. Defaults to ``None``: the dtype of the weights.
         action_key (NestedKey): where the action is written, ``[*B, A]``. Defaults to
             ``"action"``.
 
     Raises:
-        ValueError: a size is no positive int, or ``low`` is not below ``high``.
+        ValueError: a size is not a positive int, or ``low`` is not below ``high``.
 
     Examples:
         >>> import torch
@@ -192,7 +195,7 @@ class GoalConditionedActor(TensorDictModuleBase):
         self.register_buffer("low", low.clone())
         self.register_buffer("span", high - low)
         self.in_keys = list(features.in_keys)
-        self.out_keys = [unravel_key(action_key)]
+        self.out_keys = [as_key(action_key)]
 
     @dispatch
     def forward(
@@ -203,10 +206,11 @@ class GoalConditionedActor(TensorDictModuleBase):
         Args:
             tensordict (TensorDictBase): states ``[*B, D]`` and goals ``[*B, G]``.
             params (TensorDictBase, optional): parameters and buffers to use instead
-                of the module's own, such as those of a loss.
+                of the module's own, such as those of a loss. Defaults to the module's
+                own.
 
         Returns:
-            TensorDictBase: the same, with the action ``[*B, A]`` set.
+            TensorDictBase: the same tensordict, with the action ``[*B, A]``.
 
         Raises:
             KeyError: an input is missing.
@@ -227,7 +231,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
     """An action value ``Q(s, g, a)``: features and action, then a ReLU network.
 
     Args:
-        features (GoalFeatures): what the network reads besides the action. It is
+        features (GoalFeatures): the input of the network next to the action. It is
             copied: fit its statistics first.
         action_dim (int): the size ``A`` of the action.
         hidden_sizes (sequence of int): the widths of the hidden layers. Defaults to
@@ -240,7 +244,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
             ``"state_action_value"``.
 
     Raises:
-        ValueError: a size is no positive int.
+        ValueError: a size is not a positive int.
 
     Examples:
         >>> import torch
@@ -275,12 +279,12 @@ class GoalConditionedCritic(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         _check_action_dim(action_dim)
-        # A copy, also because a loss stacks the buffers of its critics: shared ones
-        # would become views of one memory, which load_state_dict cannot write.
+        # A loss stacks the buffers of its critics. Shared ones would become views of
+        # one memory, to which load_state_dict cannot write.
         self.features = copy.deepcopy(features)
         self.network = _mlp(features.width + action_dim, 1, hidden_sizes, hidden_dtype)
-        self.in_keys = [*features.in_keys, unravel_key(action_key)]
-        self.out_keys = [unravel_key(out_key)]
+        self.in_keys = [*features.in_keys, as_key(action_key)]
+        self.out_keys = [as_key(out_key)]
 
     @dispatch
     def forward(
@@ -292,11 +296,11 @@ class GoalConditionedCritic(TensorDictModuleBase):
             tensordict (TensorDictBase): states ``[*B, D]``, goals ``[*B, G]`` and
                 actions ``[*B, A]``.
             params (TensorDictBase, optional): parameters and buffers to use instead
-                of the module's own, such as those that a loss has stacked of ``C``
-                critics. ``*B`` begins with ``C`` then.
+                of the module's own, such as those of ``C`` critics, stacked by a loss;
+                ``*B`` then begins with ``C``. Defaults to the module's own.
 
         Returns:
-            TensorDictBase: the same, with the value ``[*B, 1]`` set.
+            TensorDictBase: the same tensordict, with the value ``[*B, 1]``.
 
         Raises:
             KeyError: an input is missing.
@@ -313,14 +317,14 @@ class GoalConditionedCritic(TensorDictModuleBase):
 
 
 def takes_params(network: nn.Module) -> bool:
-    """Whether a network can be called with parameters that are not its own.
+    """Returns whether a network can be called with parameters that are not its own.
 
     Args:
-        network (nn.Module): a policy or an action value.
+        network (torch.nn.Module): a policy or an action value.
 
     Returns:
-        bool: True for the networks of this file and False for those derived from them
-        with another ``forward``.
+        bool: ``True`` for the networks of this module, ``False`` for subclasses with a
+        ``forward`` of their own and for other networks.
 
     Examples:
         >>> import torch
@@ -334,7 +338,4 @@ def takes_params(network: nn.Module) -> bool:
 
 def _check_action_dim(action_dim: int) -> None:
     if not isinstance(action_dim, int) or action_dim < 1:
-        raise ValueError(
-            "action_dim is the size of the action, an int of at least 1, got "
-            f"{action_dim!r}"
-        )
+        raise ValueError(f"action_dim must be an int of at least 1, got {action_dim!r}")

@@ -1,4 +1,4 @@
-"""A transformer over entities, whose attention is read as influence by CoDA."""
+"""A transformer over entities, whose attention CoDA reads as influence."""
 
 from __future__ import annotations
 
@@ -17,47 +17,49 @@ __all__ = ["TransformerWorldModel"]
 
 
 class TransformerWorldModel(EntityDynamicsModel):
-    r"""The transition model that CoDA reads the local graph from (paper, A.7).
+    r"""The transition model from which CoDA reads the local graph (paper, A.7).
 
-    Every entity is one token, in layout order, and the action is the last one. A
-    learnt projection of its own takes each token's features (normalised by a running
-    mean and variance) to ``width`` dimensions, ``layers`` of
-    :class:`torch.nn.TransformerEncoderLayer` follow, and a learnt projection of its
-    own takes each entity's output to the expected *normalised target*
-    (:class:`EntityDynamicsModel`). The projections tell the tokens apart; there is no
-    other encoding of their positions.
+    Every entity is one token, in layout order, and the action is the last one. Each
+    token has a linear projection of its own, from its features (normalised by a running
+    mean and variance) to ``width`` dimensions. ``layers`` of
+    :class:`torch.nn.TransformerEncoderLayer` follow, and for each entity a linear
+    projection of its own to the expected *normalised target*
+    (:class:`EntityDynamicsModel`). The projections distinguish the tokens; there is no
+    positional encoding.
 
-    The likelihood that :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises
+    The likelihood that :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` maximises
     is that of a Gaussian of unit variance, without its constant: half the squared
-    error.
+    error is minimised.
 
     Args:
         layout (EntityLayout): the entities.
         action_dim (int): the size ``A`` of the action.
-        layers (int): encoder layers. Defaults to 3.
-        heads (int): attention heads a layer, a divisor of ``width``. Defaults to 4.
-        width (int): the size of the tokens. Defaults to 128.
-        predict (mapping of str to iterable of int, optional): the columns to predict of
-            some entities, as in :class:`EntityDynamicsModel`.
+        layers (int): the number of encoder layers. Defaults to ``3``.
+        heads (int): the number of attention heads in each layer, a divisor of
+            ``width``. Defaults to ``4``.
+        width (int): the size of the tokens. Defaults to ``128``.
+        predict (Mapping of str to iterable of int, optional): the columns to predict
+            of some entities, as in :class:`EntityDynamicsModel`. Defaults to all
+            columns.
 
     Keyword Args:
         feedforward (int, optional): the hidden width between two attentions. Defaults
-            to ``width``; the paper names no other size.
-        dropout (float): in every layer, while training. Defaults to 0.
-        widths (mapping of str to int, optional): the features of each entity,
-            ``layout.widths(td)``. Needed by nested layouts only.
-        action_key (NestedKey): defaults to ``"action"``.
+            to ``width``; the paper does not give it.
+        dropout (float): the dropout rate in every layer. Defaults to ``0.0``.
+        widths (Mapping of str to int, optional): the number of features of each
+            entity, ``layout.widths(td)``. Required for nested layouts only.
+        action_key (NestedKey): the action. Defaults to ``"action"``.
         out_keys (sequence of one NestedKey): where the expectation ``[*B, P]`` is
             written. Defaults to ``("prediction", "loc")``.
-        target (str): ``"change"`` (next minus now) or ``"absolute"`` (the next state,
-            centred). Defaults to ``"change"``.
-        variance_floor (float or mapping): a standard deviation in physical units:
-            columns that change less are not blown up to unit variance. One number, or
-            per entity one number or one for each predicted column. Defaults to
-            ``1e-3`` (1 mm, 1 mrad).
+        target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
+            next state, centred). Defaults to ``"change"``.
+        variance_floor (float or Mapping): the smallest standard deviation to divide
+            targets by, in physical units. One number, or for each entity one number or
+            one for each predicted column. Defaults to ``1e-3`` (1 mm, 1 mrad).
 
     Attributes:
-        predicted (dict of str to slice): where each predicted entity lies in ``P``.
+        predicted (dict of str to slice): the position of each predicted entity in
+            ``P``.
 
     Raises:
         ValueError: an argument is out of range or does not fit the layout.
@@ -106,14 +108,14 @@ class TransformerWorldModel(EntityDynamicsModel):
                 raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
         if width % heads:
             raise ValueError(
-                f"{heads} heads do not divide the width {width}: each head gets "
-                "width / heads dimensions, change one of them"
+                f"width is {width}, expected a multiple of the {heads} heads: change "
+                "one of them"
             )
         if not 0 <= dropout < 1:
-            raise ValueError(f"dropout lies in [0, 1), got {dropout!r}")
+            raise ValueError(f"dropout must be in [0, 1), got {dropout!r}")
         if len(tuple(out_keys)) != 1:
             raise ValueError(
-                f"out_keys is one key, of the expectation, got {out_keys!r}"
+                f"out_keys must be one key, of the expectation, got {out_keys!r}"
             )
         super().__init__(
             layout,
@@ -132,7 +134,7 @@ class TransformerWorldModel(EntityDynamicsModel):
         self.inputs = nn.ModuleList(
             nn.Linear(size, width) for size in (*self.widths.values(), action_dim)
         )
-        # Not nn.TransformerEncoder: its layers all begin with the same weights.
+        # Not nn.TransformerEncoder: all of its layers start with the same weights.
         self.layers = nn.ModuleList(
             nn.TransformerEncoderLayer(
                 width, heads, feedforward, self.dropout, batch_first=True
@@ -148,17 +150,17 @@ class TransformerWorldModel(EntityDynamicsModel):
     def forward_tensors(
         self, state: torch.Tensor, action: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """The expectation of the normalised target, from tensors.
+        """Predicts the expectation of the normalised target from tensors.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
             action (torch.Tensor): ``[*B, A]``; batch dimensions broadcast.
 
         Returns:
-            tuple of torch.Tensor: the expectation ``[*B, P]`` alone.
+            tuple of torch.Tensor: the expectation, ``[*B, P]``.
 
         Raises:
-            ValueError: a last dimension has another size.
+            ValueError: a last dimension has the wrong size.
         """
         tokens, batch = self._tokens(state, action)
         tokens = self._encode(tokens)
@@ -171,7 +173,7 @@ class TransformerWorldModel(EntityDynamicsModel):
     def nll(
         self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
     ) -> torch.Tensor:
-        """The negative log likelihood under unit variance, without its constant.
+        """Returns the negative log likelihood under unit variance, less its constant.
 
         Args:
             prediction (tuple of torch.Tensor): the expectation, ``[*B, P]``.
@@ -183,26 +185,26 @@ class TransformerWorldModel(EntityDynamicsModel):
         return 0.5 * (target - prediction[0]).square().mean(-1)
 
     def attention(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """The attention matrices of all layers, mean over the heads.
+        """Returns the attention matrices of all layers, averaged over the heads.
 
-        Hooks record them, so let no other thread use the model meanwhile.
+        Hooks record them: no other thread may use the model at the same time.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
             action (torch.Tensor): ``[*B, A]``; batch dimensions broadcast.
 
         Returns:
-            torch.Tensor: ``[*B, layers, N + 1, N + 1]``: how much the token of the
-            row (a query) attends to that of the column (a key); entities in layout
-            order, then the action. Rows sum to 1.
+            torch.Tensor: ``[*B, layers, N + 1, N + 1]``, the attention of the token of
+            the row (a query) to that of the column (a key); entities in layout order,
+            then the action. Rows sum to 1.
 
         Raises:
-            RuntimeError: a layer gave no attention.
-            ValueError: a last dimension has another size.
+            RuntimeError: a layer returned no attention.
+            ValueError: a last dimension has the wrong size.
         """
         tokens, batch = self._tokens(state, action)
         size = tokens.shape[1]
-        if not tokens.shape[0]:  # torch's fused attention then returns no weights
+        if not tokens.shape[0]:  # torch's fused attention would return no weights
             return tokens.new_zeros(*batch, len(self.layers), size, size)
         with _recording(list(self.layers)) as weights:
             self._encode(tokens)
@@ -211,7 +213,7 @@ class TransformerWorldModel(EntityDynamicsModel):
     def _tokens(
         self, state: torch.Tensor, action: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Size]:
-        """The input tokens ``[rows, N + 1, width]``, and the batch's shape."""
+        """Returns the input tokens ``[rows, N + 1, width]`` and the batch shape."""
         self._check_widths(state, action)
         last: Any = self.inputs[-1]
         dtype = last.weight.dtype
@@ -232,7 +234,7 @@ class TransformerWorldModel(EntityDynamicsModel):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The arguments that make this model, and its class, JSON-compatible."""
+        """The class of the model and its arguments, JSON-compatible."""
         return {
             **super().config,
             "layers": len(self.layers),
@@ -245,12 +247,12 @@ class TransformerWorldModel(EntityDynamicsModel):
 
 @contextmanager
 def _recording(layers: Sequence[Any]) -> Iterator[list[torch.Tensor]]:
-    """Collects the attention of each encoder layer that runs meanwhile, in order."""
+    """Records the attention of each encoder layer that runs in the block."""
     found: list[Any] = []
 
-    # An encoder layer asks its attention for no weights; with hooks on it, it also
-    # leaves the fused path, which would pass the attention module by.
-    def ask(module: nn.Module, args: Any, kwargs: dict[str, Any]) -> Any:
+    # An encoder layer does not request the weights of its attention. Hooks also make
+    # it leave the fused path, which does not call the attention module.
+    def request(module: nn.Module, args: Any, kwargs: dict[str, Any]) -> Any:
         return args, {**kwargs, "need_weights": True, "average_attn_weights": True}
 
     def keep(module: nn.Module, args: Any, output: Any) -> None:
@@ -258,8 +260,9 @@ def _recording(layers: Sequence[Any]) -> Iterator[list[torch.Tensor]]:
 
     hooks = []
     for layer in layers:
-        hooks.append(layer.self_attn.register_forward_pre_hook(ask, with_kwargs=True))
-        hooks.append(layer.self_attn.register_forward_hook(keep))
+        attention = layer.self_attn
+        hooks.append(attention.register_forward_pre_hook(request, with_kwargs=True))
+        hooks.append(attention.register_forward_hook(keep))
     try:
         yield found
     finally:
@@ -268,6 +271,6 @@ def _recording(layers: Sequence[Any]) -> Iterator[list[torch.Tensor]]:
     given = sum(weights is not None for weights in found)
     if not given or given != len(layers):
         raise RuntimeError(
-            f"{given} of {len(layers)} encoder layers gave their attention: the layers "
-            "must be nn.TransformerEncoderLayer with nn.MultiheadAttention"
+            f"{given} of {len(layers)} encoder layers returned their attention: use "
+            "layers of nn.TransformerEncoderLayer with nn.MultiheadAttention"
         )
