@@ -367,19 +367,17 @@ class EntityDynamicsModel(TensorDictModuleBase):
         Raises:
             ValueError: a value is not finite.
         """
-        finite = torch.isfinite(state)
-        if bool(finite.all()):
+        found = _first_non_finite(state)
+        if found is None:
             return
-        flat = finite.reshape(-1, self.state_dim)
-        row, column = (~flat).nonzero()[0].tolist()
-        value = state.reshape(-1, self.state_dim)[row, column].item()
+        row, column, value, count = found
         name = self._owner(self.slices, column)
         key: Any = self.layout.observation_key or self.layout.keys[name]
         key = self.layout.next(key) if next else key
         raise ValueError(
             f"{key!r} is {value} for entity {name!r} in row {first_row + row} "
-            f"({int((~flat).any(-1).sum())} such rows), expected finite observations: "
-            "remove or repair these rows"
+            f"({count} such rows), expected finite observations: remove or repair "
+            "these rows"
         )
 
     def check_finite_action(self, action: torch.Tensor, *, first_row: int = 0) -> None:
@@ -394,17 +392,14 @@ class EntityDynamicsModel(TensorDictModuleBase):
         Raises:
             ValueError: a value is not finite.
         """
-        finite = torch.isfinite(action)
-        if bool(finite.all()):
-            return
-        flat = finite.reshape(-1, finite.shape[-1])
-        row, column = (~flat).nonzero()[0].tolist()
-        value = action.reshape(-1, action.shape[-1])[row, column].item()
-        raise ValueError(
-            f"{self.action_key!r} is {value} in column {column} of row "
-            f"{first_row + row} ({int((~flat).any(-1).sum())} such rows), expected "
-            "finite actions: remove or repair these rows"
-        )
+        found = _first_non_finite(action)
+        if found is not None:
+            row, column, value, count = found
+            raise ValueError(
+                f"{self.action_key!r} is {value} in column {column} of row "
+                f"{first_row + row} ({count} such rows), expected finite actions: "
+                "remove or repair these rows"
+            )
 
     @staticmethod
     def _owner(slices: Mapping[str, slice], column: int) -> str:
@@ -513,3 +508,13 @@ def evaluating(module: nn.Module) -> Iterator[None]:
     finally:
         for part, training in modes:
             part.training = training
+
+
+def _first_non_finite(x: torch.Tensor) -> tuple[int, int, float, int] | None:
+    """Returns row, column, value, and the number of such rows; ``None`` if finite."""
+    bad = ~torch.isfinite(x).reshape(-1, x.shape[-1])
+    if not bool(bad.any()):
+        return None
+    row, column = bad.nonzero()[0].tolist()
+    value = x.reshape(-1, x.shape[-1])[row, column].item()
+    return row, column, value, int(bad.any(-1).sum())

@@ -100,11 +100,13 @@ class RunningNorm(nn.Module):
     def scale(self) -> torch.Tensor:
         """The standard deviation that each feature is divided by, ``[F]``."""
         var = self.var
+        scale = var.sqrt().clamp_min(self.floor)
         if self.floor:
-            return var.sqrt().maximum(torch.where(self.count > 0, self.floor, 1.0))
-        # The rounding errors of a constant must not be scaled up.
-        constant = var <= (1e-6 * self.mean).square().clamp_min(1e-24)
-        return torch.where(constant, torch.ones_like(var), var.sqrt())
+            unscaled = (self.count == 0) & var.isfinite()
+        else:
+            # The rounding errors of a constant must not be scaled up.
+            unscaled = var <= (1e-6 * self.mean).square().clamp_min(1e-24)
+        return torch.where(unscaled, torch.ones_like(scale), scale)
 
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
