@@ -142,8 +142,8 @@ def test_interrupted_and_resumed_ends_with_the_same_bytes(
     expected = fit(reference, data)
     path = tmp_path / "folder" / "fit.ckpt"
     options: dict[str, Any] = {"checkpoint": path, "checkpoint_every": 25}
-    killed = make(**kwargs)
-    forward = killed.forward_tensors
+    interrupted = make(**kwargs)
+    forward = interrupted.forward_tensors
     calls = []
 
     def dies(*args: Any) -> Any:
@@ -152,9 +152,9 @@ def test_interrupted_and_resumed_ends_with_the_same_bytes(
             raise KeyboardInterrupt
         return forward(*args)
 
-    monkeypatch.setattr(killed, "forward_tensors", dies)
+    monkeypatch.setattr(interrupted, "forward_tensors", dies)
     with pytest.raises(KeyboardInterrupt):
-        fit(killed, data, **options)
+        fit(interrupted, data, **options)
     assert [p.name for p in path.parent.iterdir()] == ["fit.ckpt"]
     # What an interrupted write leaves is removed by the next call.
     (path.parent / ".partial-12-fit.ckpt").write_text("half")
@@ -165,7 +165,7 @@ def test_interrupted_and_resumed_ends_with_the_same_bytes(
     assert [p.name for p in path.parent.iterdir()] == ["fit.ckpt"]
     assert_equal(resumed, reference)
     assert (history == expected).all()
-    # Finished: the same call does nothing, another number of steps goes on.
+    # Finished: the same call does nothing, a larger number of steps continues.
     again = make(**kwargs)
     before = path.read_bytes()
     assert (fit(again, data, **options) == expected).all()
@@ -354,7 +354,7 @@ def test_statistics_that_the_model_has_are_kept() -> None:
     assert torch.equal(model.target_scale, scale)
 
 
-def test_denormals_are_flushed_meanwhile_and_then_as_before() -> None:
+def test_denormals_are_flushed_in_the_block_only() -> None:
     denormal = torch.tensor([1e-310], dtype=torch.float64)
     seen = []
     with module._flushing_denormals(True):

@@ -462,12 +462,12 @@ def _split(
 
 
 @contextmanager
-def _flushing_denormals(wanted: bool) -> Iterator[None]:
-    """Treats denormal numbers as zero in the block, if wanted."""
+def _flushing_denormals(enabled: bool) -> Iterator[None]:
+    """Treats denormal numbers as zero in the block, if enabled."""
     # torch has no getter for the current setting: add two denormal numbers instead.
     denormal = torch.tensor([1e-310], dtype=torch.float64)
     already = not bool((denormal + denormal).any())
-    changed = wanted and not already and torch.set_flush_denormal(True)
+    changed = enabled and not already and torch.set_flush_denormal(True)
     try:
         yield
     finally:

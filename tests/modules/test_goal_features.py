@@ -105,7 +105,7 @@ def test_widths_of_fetch_push():
 
 
 def test_a_swap_moves_the_relative_features():
-    """They follow the state in the row, whatever was stored beside it."""
+    """They are computed from the swapped state."""
     features = GoalFeatures(push(), reference="gripper")
     td = rows(4)
     before = features(td.clone())["features"]

@@ -153,7 +153,7 @@ def make_rows(n: int = 50) -> TensorDict:
 def test_statistics_against_torch(memmap, chunk, monkeypatch, tmp_path):
     monkeypatch.setattr(running_norm, "_ROWS_PER_CHUNK", chunk)
     rows = make_rows()
-    rows["observation"][:, 0] = 3.0  # never moves: the floor holds
+    rows["observation"][:, 0] = 3.0  # constant: divided by the floor
     rows["action"][:, 0] = 0.25
     want = rows.double()
     if memmap:

@@ -135,7 +135,7 @@ def test_is_init_starts_a_window_in_its_row_only():
         torch.testing.assert_close(td["next", "lmp", "plan"][row], first["plan"][row])
 
 
-def test_no_prior_is_asked_within_a_window():
+def test_the_prior_is_called_at_the_start_of_a_window_only():
     model = make_model()
     actor = LMPActor(model)
     td = carry(actor(make_rows(3)), is_init=torch.zeros(3, 1, dtype=torch.bool))
