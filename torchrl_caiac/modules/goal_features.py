@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._layout_reading import check_width
 from torchrl_caiac._keys import as_key, get_leaf
+from torchrl_caiac._layout_reading import check_width
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.running_norm import RunningNorm, gather_statistics
 
