@@ -29,22 +29,22 @@ templates_path = ["_templates"]
 exclude_patterns = ["_build", "tutorials"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 
-# The reference: every name in the __all__ of every room, nothing else.
+# The reference lists the names in the __all__ of every subpackage, and nothing else.
 autosummary_generate = True
 autosummary_ignore_module_all = False
 autosummary_imported_members = True
-# What the package itself exports is described in its room, if it has one.
-_ROOMS = ("data", "envs", "influence", "modules", "objectives", "transforms")
+# Names that the package re-exports are documented in their own subpackage.
+_SUBPACKAGES = ("data", "envs", "influence", "modules", "objectives", "transforms")
 autosummary_context = {
-    "rooms": {
-        name: f"torchrl_caiac.{room}.{name}"
-        for room in _ROOMS
-        for name in importlib.import_module(f"torchrl_caiac.{room}").__all__
+    "reexported": {
+        name: f"torchrl_caiac.{subpackage}.{name}"
+        for subpackage in _SUBPACKAGES
+        for name in importlib.import_module(f"torchrl_caiac.{subpackage}").__all__
         if name in torchrl_caiac.__all__
     }
 }
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"  # in the signature's place: the Args sections
+autodoc_typehints = "none"  # the Args sections have the types
 add_module_names = False
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False

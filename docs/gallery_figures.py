@@ -1,4 +1,4 @@
-"""Figures of torchrl_caiac.plotting in the tutorials: pyplot does not know of them."""
+"""Shows figures of torchrl_caiac.plotting, which pyplot does not know, in tutorials."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _SEEN: weakref.WeakSet[Figure] = weakref.WeakSet()
 def save_figures(
     block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any]
 ) -> str:
-    """Saves what a block has made, for sphinx-gallery to show (an image scraper)."""
-    # Pyplot's own figures are left to the scraper of sphinx-gallery.
+    """Saves the new figures of a code block (an image scraper of sphinx-gallery)."""
+    # The scraper of sphinx-gallery saves pyplot's own figures.
     _SEEN.update(pyplot.figure(number) for number in pyplot.get_fignums())
     paths = []
     for value in block_vars["example_globals"].values():

@@ -1,9 +1,11 @@
-"""The code that README.md and docs/usage.md show runs, on a small dataset."""
+"""The code in README.md and docs/usage.md runs, on a small dataset."""
 
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import minari
@@ -17,6 +19,11 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.data import load_transitions, mix_trajectories, offline_buffer
+from torchrl_caiac.evaluation import (
+    Candidate,
+    compare_influence,
+    publish_comparison,
+)
 from torchrl_caiac.influence import CAI, AttentionInfluence, score_buffer
 from torchrl_caiac.modules import (
     GaussianWorldModel,
@@ -36,7 +43,7 @@ def python_blocks(text: str) -> list[str]:
 
 
 def make_dataset(name: str, episodes: int = 4, steps: int = 30) -> None:
-    """A dataset with the README's 34 observation columns and 4 action columns."""
+    """Creates a dataset with the README's 34 observation and 4 action columns."""
     rng = np.random.default_rng(0)
     buffers = []
     for index in range(episodes):
@@ -60,13 +67,14 @@ def make_dataset(name: str, episodes: int = 4, steps: int = 30) -> None:
     )
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # a dataset without an author
 def test_bring_your_own_dataset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    make_dataset("my/pushing-v0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a dataset without an author
+        make_dataset("my/pushing-v0")
     (code,) = [
         b for b in python_blocks((ROOT / "README.md").read_text()) if "CAI(" in b
     ]
@@ -89,7 +97,7 @@ LAYOUT = EntityLayout(
 
 
 def run_usage(start: str, **given: object) -> dict[str, object]:
-    """Runs the code block of docs/usage.md that begins so; what it leaves behind."""
+    """Runs the code block of docs/usage.md that starts so; returns its variables."""
     (code,) = [block for block in USAGE if block.startswith(start)]
     scope = {
         "AttentionInfluence": AttentionInfluence,
@@ -120,7 +128,7 @@ def run_usage(start: str, **given: object) -> dict[str, object]:
 
 @pytest.fixture
 def scored(flat_data: TensorDictBase) -> TensorDictBase:
-    """The shared trajectories, nothing in them influenced."""
+    """Returns the shared trajectories with scores: nothing is influenced."""
     flat_data["caiac", "score"] = torch.zeros(len(flat_data), 3)
     return flat_data
 
@@ -175,7 +183,7 @@ def test_mixture(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("expert", "random"):
-        # Ten times the same four trajectories.
+        # The same four trajectories, ten times.
         rows = torch.cat([scored] * 10)
         rows["episode"] = rows["episode"] + 4 * torch.arange(10).repeat_interleave(
             len(scored)
@@ -195,6 +203,57 @@ def test_coda(scored: TensorDictBase) -> None:
     run_usage("attention = ", rb=rb, transformer=model)
     assert rb.sample()["coda", "graph"].shape == (8, 4, 3)
     assert rb.sample()["caiac", "swapped"].shape == (8, 3)
+
+
+@in_memory
+def test_comparison_of_estimators(
+    flat_data: TensorDictBase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    transformer = TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8)
+    influenced = torch.rand(len(flat_data), 3) < 0.5
+    table = run_usage(
+        "table = ",
+        data=flat_data,
+        truth=SimpleNamespace(influenced=influenced),
+        model=GaussianWorldModel(LAYOUT, 2, (16, 16)),
+        attention=AttentionInfluence(transformer),
+        Candidate=Candidate,
+        compare_influence=compare_influence,
+        publish_comparison=publish_comparison,
+    )["table"]
+    assert [row["estimator"] for row in table if row["entity"] == "all"] == [
+        "caiac",
+        "coda",
+    ]
+    assert (tmp_path / "results" / "influence.csv").exists()
+
+
+@in_memory
+def test_nested_layout(nested_data: TensorDictBase) -> None:
+    layout = run_usage("layout = ", EntityLayout=EntityLayout)["layout"]
+    assert layout.names == ("arm", "kettle")
+    nested_data["caiac", "score"] = torch.zeros(len(nested_data), 2)
+    rb = offline_buffer(nested_data, batch_size=8)
+    rb.append_transform(CAIACTransform(layout))
+    assert rb.sample()["caiac", "swapped"].any()
+
+
+@in_memory
+def test_rewards_of_transitions(scored: TensorDictBase) -> None:
+    rb = offline_buffer(scored, batch_size=8)
+    run_usage("rb.append_transform(\n    CAIACTransform(layout, threshold", rb=rb)
+    batch = rb.sample()
+    assert batch["caiac", "counterfactual"].sum() == 4
+
+
+def test_citation_has_the_version() -> None:
+    def versions(name: str, pattern: str) -> list[str]:
+        return re.findall(pattern, (ROOT / name).read_text(), flags=re.MULTILINE)
+
+    cited = versions("CITATION.cff", r"^version: (\S+)$")
+    assert cited == versions("pyproject.toml", r'^version = "(\S+)"$')
+    assert len(cited) == 1
 
 
 @pytest.mark.gpu
