@@ -2,15 +2,15 @@
 Offline RL on Fetch-Push
 ========================
 
-A robot is to push two cubes to their goals, and may only learn from logged episodes:
-some of a scripted expert, most of them of random actions. A goal is about both cubes;
-an action moves one of them, or mostly none. This page goes the whole way from the
-environment to a policy, with TD3, hindsight goals and counterfactuals (sections 4.3,
-A.3.1 and A.5.2 of the paper).
+A robot learns to push two cubes to their goals, from logged episodes only: some of a
+scripted expert, most of them of random actions. A goal covers both cubes; an action
+moves one of them, and mostly none. This tutorial goes from the environment to a policy,
+with TD3, hindsight goals and counterfactuals (sections 4.3, A.3.1 and A.5.2 of the
+paper).
 
-It does so on too little data and with far too few gradient steps, so that it runs in a
-minute or two, and shows how the pieces fit together. What counterfactuals are worth is
-another question: ``make fetch-push`` measures that, and :doc:`/results` reports it.
+It shows how the parts fit together, and runs in a minute or two. For a good policy it
+has too little data and far too few gradient steps. ``make fetch-push`` measures the
+effect of counterfactuals, see :doc:`/results`.
 """
 
 import tempfile
@@ -57,17 +57,17 @@ torch.manual_seed(0)
 torch.set_num_threads(1)
 
 # %%
-# The environment and its expert
-# ------------------------------
-# ``FetchPushCubes`` is a Gymnasium environment with goals. The layout says which of
-# the 34 columns of the observation are whose, and which cube each goal is about. The
-# gripper is fixed: it is never swapped.
+# Environment and expert
+# ----------------------
+# ``FetchPushCubes`` is a Gymnasium environment with goals. The layout says which of the
+# 34 observation columns describe which entity, and which goal columns belong to which
+# cube. The gripper is fixed: it is never swapped.
 
 layout = fetch_push_layout(2)
 layout
 
 # %%
-# The expert's action depends on what it sees alone, so that a policy can learn it. The
+# The expert's action depends on the observation only, so a policy can learn it. The
 # reward is -1 until both cubes are within 5 cm of their goals.
 
 env = FetchPushCubes(2, render_mode="rgb_array")
@@ -83,7 +83,8 @@ print("steps until both cubes were at their goals:", first)
 print("there at the end:", bool(info["success"]))
 
 # %%
-# Frames of this episode, where there is OpenGL. Goals are balls of their cube's colour.
+# Frames of this episode, if OpenGL is available. Each goal is a ball of its cube's
+# colour.
 
 shown = [0, first // 3, 2 * first // 3, first]
 try:
@@ -96,11 +97,12 @@ env.close()
 figure
 
 # %%
-# Two datasets, and a mixture
-# ---------------------------
-# Episodes are kept as Minari datasets, to be read by any other program too. The
-# simulator's states go with them: we shall ask it for the truth. ``workers=1`` collects
-# in this process; a script with ``if __name__ == "__main__":`` can have more.
+# Two datasets and a mixture
+# --------------------------
+# Episodes are stored as Minari datasets, which other programs can read too. They
+# include the states of the simulator, for the ground truth below. ``workers=1``
+# collects in this process; more workers need a script with ``if __name__ ==
+# "__main__":``.
 
 folder = tempfile.TemporaryDirectory()
 options = {"root": folder.name, "workers": 1, "progress": False}
@@ -115,10 +117,10 @@ for dataset in datasets.values():
     print(f"{dataset.id}: {dataset.storage.metadata['description']}")
 
 # %%
-# :func:`~torchrl_caiac.data.load_minari` writes them as rows of TorchRL transitions,
-# memory-mapped, and :func:`~torchrl_caiac.data.mix_trajectories` draws whole episodes
-# of several datasets. Smaller fractions are the beginnings of larger ones, so that
-# results with less data can be compared.
+# :func:`~torchrl_caiac.data.load_minari` converts them to memory-mapped TorchRL
+# transitions, and :func:`~torchrl_caiac.data.mix_trajectories` draws whole episodes
+# from several datasets. A smaller fraction is the beginning of a larger one, so results
+# with less data are comparable.
 
 rows = {
     name: load_minari(
@@ -131,16 +133,16 @@ tenth = mix_trajectories([rows["expert"], rows["random"]], fraction=0.1)
 for name, part in (("all", data), ("a tenth", tenth)):
     episodes = part["episode"].unique()
     share = (part["source"] == 0).float().mean()
-    print(f"{name}: {len(part)} rows, {len(episodes)} episodes, expert's {share:.0%}")
+    print(f"{name}: {len(part)} rows, {len(episodes)} episodes, {share:.0%} expert")
 
 # %%
-# What the action influences
-# --------------------------
-# The world model predicts by how much positions change, and everything below 1 mm is
-# left to chance (``variance_floor``). With a floor far below that, scores of resting
-# cubes are mostly noise.
+# World model and influence
+# -------------------------
+# The world model predicts the change of the positions. Changes below 1 mm count as
+# noise (``variance_floor``). With a much smaller floor, the scores of resting cubes are
+# mostly noise.
 
-positions = {"gripper": 5, "cube0": 3, "cube1": 3}  # the first columns of each
+positions = {"gripper": 5, "cube0": 3, "cube1": 3}  # first columns of each entity
 model = GaussianWorldModel(
     layout,
     action_dim=4,
@@ -154,8 +156,8 @@ for name in positions:
     print(f"{name}, error in mm:", [round(x, 2) for x in error.tolist()])
 
 # %%
-# Scores are made once for every row, and kept beside the data. As in the paper a score
-# is that of the row's own state, the mean over three steps.
+# Scores are computed once for every row and stored with the data. As in the paper, a
+# score is for the row's own state (``lookahead=0``) and averaged over three steps.
 
 rb = offline_buffer(data)
 score_buffer(rb, CAI(model), smoothing=3, lookahead=0, progress=False)
@@ -164,9 +166,9 @@ for name, share in zip(layout.names, below, strict=True):
     print(f"{name}: score at most 0.05 in {share:.0%} of the rows")
 
 # %%
-# Do they find influence? On the held-out episodes the simulator knows: restore a row's
-# state, try 24 actions, and see whether two of them bring a cube to places more than a
-# millimetre apart.
+# Do the scores find the influence? The simulator gives the ground truth of the held-out
+# episodes: restore a row's state, try 24 actions, and check whether two of them bring a
+# cube to places more than a millimetre apart.
 
 held_out = rows["held-out"].clone()
 score_buffer(
@@ -193,8 +195,8 @@ for name in ("cube0", "cube1"):
     )
 
 # %%
-# Along one of these episodes, the one that has most influence on both cubes. With so
-# few data a score also rises when the *other* cube is touched.
+# Scores along the episode with most influence on both cubes. With so little data, a
+# score also rises while the *other* cube is touched.
 
 contacts = torch.stack([t[:, 1:].sum(0) for t in truth.reshape(-1, 100, 3)])
 episode = int(contacts.amin(-1).argmax())
@@ -213,16 +215,17 @@ figure
 # %%
 # Counterfactuals and hindsight goals
 # -----------------------------------
-# Two transforms make the batches. The first one makes the last half counterfactual: a
-# cube that the action does not influence is taken from another row, its goal with it.
-# The second one relabels (A.5.2): half of the real rows get a goal that was achieved
-# later in their episode, half of the counterfactual ones a goal that a counterfactual
-# row achieves. All these rewards are made anew, from the *next* achieved goal.
+# Two transforms augment the batches. The first one makes the last half counterfactual:
+# a cube that the action does not influence is replaced by that of another row, with its
+# goal. The second one relabels (section A.5.2): half of the real rows get a goal that
+# was achieved later in their episode, and half of the counterfactual rows a goal that a
+# counterfactual row achieves. It recomputes the rewards of all these rows from the
+# *next* achieved goal.
 #
-# Swap first, then relabel. ``HindsightGoal`` is the buffer's ``sample_unit`` too: that
-# is how it sees which rows were sampled, and reads what came after them.
+# Swap first, then relabel. ``HindsightGoal`` is also the buffer's ``sample_unit``,
+# which tells it which rows were sampled.
 
-data["row"] = torch.arange(len(data))  # to find recorded rows again, for the figure
+data["row"] = torch.arange(len(data))  # the figure below needs the recorded rows
 goals = HindsightGoal(layout, fetch_push_reward)
 rb = offline_buffer(data.exclude("info"), sample_unit=goals)
 rb.append_transform(CAIACTransform(layout, threshold=THRESHOLD))
@@ -244,13 +247,12 @@ for name, kind in (("real", ~counterfactual), ("counterfactual", counterfactual)
     )
 
 # %%
-# Most real rows that were relabelled are successes: in the few steps to their goal
-# little moved.
+# Most relabelled real rows are successes: little moved in the few steps to their goal.
 #
-# Some of the counterfactual rows, seen from above. Outlines are the cubes as recorded,
-# filled squares as sampled, stars the goals; the dot is the gripper, and the arrow the
-# recorded action. Nothing keeps a cube from being swapped to where the gripper is: the
-# method takes it that objects rarely touch.
+# The figure shows some counterfactual rows from above. Outlines are cubes as recorded,
+# filled squares as sampled, stars are goals, the dot is the gripper, and the arrow is
+# the recorded action. A swap may move a cube to where the gripper is: the method
+# assumes that objects rarely touch.
 
 swapped = batch["caiac", "swapped"][:, 1:].sum(-1)
 examples = torch.cat([batch[swapped == 1][:2], batch[swapped == 2][:2]])
@@ -276,10 +278,10 @@ fig.tight_layout()
 # %%
 # TD3 with goals
 # --------------
-# Actor and critics see the positions of the cubes relative to the gripper and to the
-# goals, besides state and goal. ``GoalFeatures`` computes them within the networks:
-# stored ones would describe the cube that was swapped out. The loss bounds its targets
-# by what a return can be, -1 / (1 - 0.97) to 0.
+# The inputs of actor and critics are state, goal, and the positions of the cubes
+# relative to the gripper and to the goals. ``GoalFeatures`` computes these within the
+# networks, since stored ones would describe the cube before the swap. The loss clips
+# its targets to the possible range of a return, -1 / (1 - 0.97) to 0.
 
 features = GoalFeatures(layout, reference="gripper")
 features.fit_statistics(rb.sample(10_000))
@@ -295,7 +297,7 @@ actor_optimizer, critic_optimizer = (
 
 
 def descend(value: torch.Tensor, optimizer: torch.optim.Optimizer) -> None:
-    """One gradient step."""
+    """Takes one gradient step."""
     optimizer.zero_grad()
     value.backward()
     optimizer.step()
@@ -307,7 +309,7 @@ for step in range(1, STEPS + 1):
     batch = rb.sample(256)
     value_loss, info = loss.value_loss(batch)
     descend(value_loss, critic_optimizer)
-    if step % 2 == 0:  # the policy every other step
+    if step % 2 == 0:  # policy delay
         descend(loss.actor_loss(batch)[0], actor_optimizer)
         updater.step()
     if step % 250 == 0:
@@ -318,8 +320,8 @@ for step in range(1, STEPS + 1):
         )
 
 # %%
-# What the critics have learnt so far: their value of the expert's actions along the
-# held-out episodes, which should rise towards 0 as the cubes come to their goals.
+# The critics' values of the expert's actions along the held-out episodes. They should
+# rise towards 0 as the cubes approach their goals.
 
 torch.set_flush_denormal(False)
 with torch.no_grad():
@@ -334,10 +336,10 @@ ax.set(xlabel="step", ylabel="value", title="dotted: the first success of an epi
 fig.tight_layout()
 
 # %%
-# The policy plays
-# ----------------
-# Ten episodes from new starts. As in the paper a cube counts as brought to its goal if
-# it is there at some step; none starts there.
+# Evaluation
+# ----------
+# Ten episodes from new starts. As in the paper, a cube has reached its goal if it is
+# there at some step. No cube starts there.
 
 env = make_fetch_push_env(2)
 env.set_seed(1000)
@@ -348,14 +350,14 @@ after = played["next"]
 for i in (0, 1):
     count = int(after["cube_success"][..., i].any(1).sum())
     print(f"episodes with cube{i} at its goal: {count} of 10")
-print("with both there at once:", int(after["success"].any(1).sum()), "of 10")
+print("with both at the same time:", int(after["success"].any(1).sum()), "of 10")
 start, end = played["achieved_goal"][:, 0], after["achieved_goal"][:, -1]
 moved = (end - start).unflatten(-1, (2, 3)).norm(dim=-1)
 print("cubes moved by more than 1 cm:", int((moved > 0.01).sum()), "of 20")
 folder.cleanup()
 
 # %%
-# These numbers say nothing about the method, for or against it: 100 episodes and 1,000
-# gradient steps are far from enough for that. The study has 2,000 episodes, tens of
-# thousands of steps, several seeds, and arms that tell the swap from the relabelling
-# that comes with it (``examples/fetch_push``, ``make fetch-push``).
+# These numbers say nothing about the method: 100 episodes and 1,000 gradient steps are
+# far too few. The study has 2,000 episodes, tens of thousands of steps, several seeds,
+# and methods that separate the effect of the swap from that of the relabelling
+# (``make fetch-push``).

@@ -3,9 +3,9 @@ Your first counterfactuals
 ==========================
 
 A point robot shares a table with two pucks. It moves by its action; a puck moves only
-while the robot touches it. From logged transitions alone we learn which puck the robot
-influences in which state, and then let the other puck change places with that of
-another sample: a transition that was never recorded, but could have been.
+while the robot touches it. From logged transitions we learn which puck the robot
+influences in which state. Then we swap the other puck for that of another sample. The
+result is a transition that was never recorded, but could have been.
 """
 
 import matplotlib.pyplot as plt
@@ -24,15 +24,15 @@ torch.set_num_threads(1)
 # %%
 # A table with two pucks
 # ----------------------
-# States are six numbers: the positions of the robot and of both pucks, in metres. A
-# step moves the robot by up to 8 cm along each axis, and a puck that it then overlaps
-# is pushed out of the way.
+# A state has six numbers: the positions of the robot and of both pucks, in metres. A
+# step moves the robot by up to 8 cm along each axis. A puck that it then overlaps is
+# pushed away.
 
-REACH, STEP = 0.15, 0.08  # metres: distance of touch, largest move per axis
+REACH, STEP = 0.15, 0.08  # metres: distance of contact, largest move along an axis
 
 
 def step(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    """The next state ``[*B, 6]`` of states ``[*B, 6]`` under actions ``[*B, 2]``."""
+    """Returns next states ``[*B, 6]`` of states ``[*B, 6]``, actions ``[*B, 2]``."""
     robot = state[..., 0:2] + STEP * action
     positions = [robot]
     for puck in (state[..., 2:4], state[..., 4:6]):
@@ -44,9 +44,9 @@ def step(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 
 
 # %%
-# The logged behaviour wanders about, and in half of the steps heads for one of the
-# pucks. Transitions are stored as TorchRL does: next states under ``"next"``, and
-# every row knows its trajectory by ``"episode"``.
+# The logged behaviour moves at random, and in half of the steps towards one of the
+# pucks. Transitions have TorchRL's format, with next states under ``"next"``. The key
+# ``"episode"`` has the number of each row's trajectory.
 
 EPISODES, LENGTH = 300, 50
 state = torch.rand(EPISODES, 6) * 1.6 - 0.8
@@ -84,9 +84,10 @@ data = TensorDict(
 data
 
 # %%
-# Which columns belong to whom
-# ----------------------------
-# The layout names the entities once. The robot is ``fixed``: it is never swapped.
+# Entities
+# --------
+# The layout says which columns describe which entity. The robot is ``fixed``: it is
+# never swapped.
 
 layout = EntityLayout(
     {"robot": [0, 1], "puck A": [2, 3], "puck B": [4, 5]}, fixed=["robot"]
@@ -94,11 +95,10 @@ layout = EntityLayout(
 layout
 
 # %%
-# A world model, and influence
-# ----------------------------
+# World model and influence
+# -------------------------
 # The model predicts a Gaussian for the change of every entity. ``variance_floor`` is
-# a standard deviation in metres: chance has at least so much to do with each change,
-# and differences well below it do not count.
+# its smallest standard deviation, in metres. Changes well below it count as noise.
 
 model = GaussianWorldModel(
     layout, action_dim=2, hidden_sizes=(128, 128), variance_floor=5e-3
@@ -110,9 +110,9 @@ print("steps:", history["step"].tolist())
 print("validation NLL:", [round(x, 2) for x in history["validation_nll"].tolist()])
 
 # %%
-# Causal action influence asks: had the robot acted otherwise, how different would this
-# entity's next state be? :func:`~torchrl_caiac.influence.score_buffer` answers once for
-# every stored row and keeps the answers in the buffer.
+# Causal action influence measures how much the next state of an entity depends on the
+# action. :func:`~torchrl_caiac.influence.score_buffer` computes it once for every row
+# and stores the scores in the buffer.
 
 rb = ReplayBuffer(
     storage=LazyTensorStorage(len(data)),
@@ -125,8 +125,8 @@ score = rb.storage[:]["caiac", "score"]
 print(score.shape)
 
 # %%
-# This world is ours, so that we can ask it for the truth: try 32 actions in every
-# state, and see whether a puck's next position varies by more than a millimetre.
+# Here we know the dynamics, so we can compute the ground truth: try 32 actions in every
+# state, and check whether a puck's next position varies by more than a millimetre.
 
 tried = 2 * torch.rand(32, 2) - 1
 outcome = step(data["observation"][:, None], tried[None])  # [T, 32, 6]
@@ -142,10 +142,10 @@ for i in (1, 2):
     )
 
 # %%
-# Along one trajectory: scores as lines, and true influence as bands below them.
+# Along one trajectory, the lines are scores, and the bars below them the ground truth.
 
 contacts = influenced[:, 1:].reshape(EPISODES, LENGTH, 2).sum(1)
-episode = int(contacts.amin(-1).argmax())  # one with both pucks
+episode = int(contacts.amin(-1).argmax())  # one with contacts of both pucks
 rows = slice(episode * LENGTH, (episode + 1) * LENGTH)
 fig, ax = plt.subplots(figsize=(7, 3))
 for i, color in ((1, "tab:orange"), (2, "tab:blue")):
@@ -167,10 +167,10 @@ fig.tight_layout()
 # %%
 # Counterfactual batches
 # ----------------------
-# The transform is appended to the buffer, and from then on the last half of each batch
-# is counterfactual. Nothing else about your training loop changes. In that half, the
-# uninfluenced pucks come from other rows in which they were uninfluenced too, with
-# their own next states; what the robot influences stays, and so do the actions.
+# Append the transform to the buffer, and the last half of each batch is counterfactual.
+# The training loop does not change. In this half, uninfluenced pucks come from other
+# rows in which they are uninfluenced too, with their next states. What the robot
+# influences stays, and so do the actions.
 
 rb.append_transform(
     CAIACTransform(
@@ -184,22 +184,22 @@ for i, name in enumerate(layout.names):
     print(f"{name}: swapped in {int(swapped[:, i].sum())} rows")
 
 # %%
-# Are these transitions possible? Once more we ask the world: does its step lead from
-# the counterfactual state, by the recorded action, to the counterfactual next state?
+# Are these transitions feasible? We check with the dynamics: does the recorded action
+# lead from the counterfactual state to the counterfactual next state?
 
 made = batch[swapped.any(-1)]
 error = (step(made["observation"], made["action"]) - made["next", "observation"]).abs()
-possible = (error.amax(-1) < 1e-3).float().mean()
-print(f"possible counterfactual transitions: {possible:.1%}")
+feasible = (error.amax(-1) < 1e-3).float().mean()
+print(f"feasible counterfactual transitions: {feasible:.1%}")
 
 # %%
-# A puck that a swap put within the robot's reach would make an impossible one: the
-# method assumes that contacts are rare enough. Below, some of the robot's steps, with
-# the pucks as they were recorded and as they were swapped in.
+# A transition is infeasible if the swap puts a puck within reach of the robot: the
+# method assumes that contacts are rare. The figure shows four steps, with the pucks as
+# recorded and as swapped.
 
 original = data["observation"]
 fig, axes = plt.subplots(1, 4, figsize=(10, 2.8), sharex=True, sharey=True)
-# The robot is never swapped: its position finds the recorded row again.
+# The robot is never swapped: its position identifies the recorded row.
 for ax, row in zip(
     axes, made[swapped[swapped.any(-1)].sum(-1).argsort()][:4], strict=True
 ):

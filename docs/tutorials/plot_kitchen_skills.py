@@ -2,15 +2,15 @@
 Skills in the kitchen
 =====================
 
-Microwave demonstrations were recorded while the slide cabinet happened to be open,
-kettle demonstrations while it was closed. An agent that learns goal-conditioned skills
-from them is then asked for both with the cabinet closed. Is a closed cabinet a reason
-to push the kettle? In the data it is. This page is the paper's motivating experiment
-(section 4.1) in small: demonstrations, influence, counterfactual windows, latent motor
-plans, and episodes of each task with and without counterfactuals.
+The slide cabinet is open in all microwave demonstrations and closed in all kettle
+demonstrations. An agent learns goal-conditioned skills from them, and is evaluated on
+both tasks with the cabinet closed. In the data a closed cabinet means that the robot
+pushes the kettle. Counterfactuals remove this correlation.
 
-It is small so that it runs in a minute or two. The experiment proper, with more
-demonstrations, seeds and episodes, is ``make demo``; :doc:`/results` has its results.
+This tutorial is a small version of the paper's motivating experiment (section 4.1):
+demonstrations, influence, counterfactual windows, latent motor plans, and episodes of
+both tasks with and without counterfactuals. It runs in a minute or two. ``make demo``
+has more demonstrations, seeds and episodes, see :doc:`/results`.
 """
 
 import tempfile
@@ -46,11 +46,12 @@ torch.set_num_threads(1)
 # %%
 # Demonstrations
 # --------------
-# The scripted expert acts in gymnasium-robotics' Franka-Kitchen, with noise on its way
-# and on its actions. ``MICROWAVE_KETTLE`` says which tasks, from which starts. We take
-# 30 demonstrations of each, and two more that only check the scores. They become
-# Minari datasets, and those TorchRL rows. ``workers=1`` collects in this process; a
-# script with ``if __name__ == "__main__":`` can have more.
+# The scripted expert acts in gymnasium-robotics' Franka-Kitchen, with noise on its
+# waypoints and its actions. ``MICROWAVE_KETTLE`` has the tasks and their starts. We
+# collect 30 demonstrations of each task, and two held-out ones to check the scores.
+# They are stored as Minari datasets and read as TorchRL transitions. ``workers=1``
+# collects in this process; more workers need a script with ``if __name__ ==
+# "__main__":``.
 
 folder = tempfile.TemporaryDirectory()
 options = {"root": folder.name, "workers": 1, "progress": False}
@@ -59,7 +60,7 @@ options = {"root": folder.name, "workers": 1, "progress": False}
 def demonstrations(
     dataset_id: str, episodes: int, seed: int
 ) -> tuple[MinariDataset, TensorDict]:
-    """Demonstrations of both tasks, as a Minari dataset and as TorchRL rows."""
+    """Collects both tasks; returns a Minari dataset and TorchRL transitions."""
     groups = [replace(group, episodes=episodes) for group in MICROWAVE_KETTLE]
     dataset, _ = create_kitchen_demonstrations(
         dataset_id, demonstrations=groups, seed=seed, **options
@@ -82,16 +83,16 @@ for name, task in (("microwave", MICROWAVE), ("kettle", KETTLE)):
     )
 
 # %%
-# Ten entities make up the 30 columns of the state. A goal has a value for every column
-# of every object: an agent is told where *everything* has to be in the end.
+# The 30 columns of the state describe ten entities. A goal has a value for every column
+# of every object: it says where *everything* has to be in the end.
 
 layout
 
 # %%
-# A world model, and influence
-# ----------------------------
-# Influence is about what other actions would have done. Demonstrations hardly show
-# that, so as many random actions are added, done in states of the demonstrations.
+# World model and influence
+# -------------------------
+# Influence depends on what other actions would have done. Demonstrations hardly show
+# that. We therefore add as many random actions, taken in states of the demonstrations.
 
 random = kitchen_transitions(
     create_kitchen_random(dataset, "kitchen/random-v0", **options), progress=False
@@ -104,9 +105,9 @@ print("rows:", len(data), "of demonstrations,", len(random), "random")
 print("validation NLL:", [round(x, 2) for x in history["validation_nll"].tolist()])
 
 # %%
-# The held-out demonstrations show what scores are worth. In each of their states the
-# simulator tries 16 actions: an object that two of them bring to places more than 2 mm
-# (or mrad) apart is truly influenced.
+# The held-out demonstrations check the scores. In each of their states the simulator
+# tries 16 actions. An object is influenced if two of them bring it to places more than
+# 2 mm (or mrad) apart. This is the ground truth.
 
 score_buffer(offline_buffer(held_out), CAI(model), lookahead=0, progress=False)
 states = torch.cat([held_out["sim", "qpos"], held_out["sim", "qvel"]], -1)
@@ -117,7 +118,7 @@ for name in ("microwave", "kettle"):
     i = layout.names.index(name)
     score = held_out["caiac", "score"][:, i]
     print(
-        f"{name}: truly influenced in {truth[:, i].float().mean():.0%} of the rows, "
+        f"{name}: influenced in {truth[:, i].float().mean():.0%} of the rows, "
         f"score above {THRESHOLD} in {(score > THRESHOLD).float().mean():.0%}; ROC-AUC "
         f"{roc_auc(score, truth[:, i]):.3f}"
     )
@@ -128,7 +129,8 @@ print(
 )
 
 # %%
-# Along a microwave demonstration the hand comes, takes the handle, and opens:
+# Scores along a microwave demonstration: the hand approaches, grasps the handle, and
+# opens the microwave.
 
 shown = held_out["episode"] == 0
 figure = plot_influence(
@@ -145,12 +147,12 @@ figure
 # %%
 # Why scores look ahead
 # ---------------------
-# While the hand still comes, nothing is influenced. By the scores of these rows alone
-# the microwave could change places with that of a kettle demonstration, its goal with
-# it, and the window would say: where the microwave shall stay closed, go to the
-# microwave. But an object that the robot is *about* to move is what its actions are
-# for. With ``lookahead=100`` a row has the highest score of all the rest of its
-# demonstration, so that such an object stays. The cabinet, which nobody touches, may
+# While the hand approaches, nothing is influenced. By the scores of these rows alone,
+# the microwave could be swapped for that of a kettle demonstration, with its goal. Such
+# a window teaches the agent to go to the microwave if the microwave has to stay closed.
+# But an object that the robot is *about* to move is the reason for its actions. With
+# ``lookahead=100`` the score of a row is the highest one of the rest of its
+# demonstration, so this object is kept. The cabinet, which the robot never touches, may
 # still be swapped.
 
 WINDOW = 10
@@ -174,13 +176,13 @@ for lookahead in (0, 100):
 # Counterfactual windows
 # ----------------------
 # Latent motor plans learn from windows of ten steps. ``WindowGoal`` gives each window a
-# later state of its demonstration as goal. ``CAIACTransform`` then makes half of them
-# counterfactual: objects that are free throughout the window change places with those
-# of other windows, as whole windows, and their goals with them.
+# later state of its demonstration as goal. ``CAIACTransform`` then makes half of the
+# windows counterfactual: objects that are uninfluenced throughout the window are
+# swapped for those of other windows, as whole windows and with their goals.
 
 
 def windows(counterfactual: bool) -> TensorDictReplayBuffer:
-    """A replay buffer of windows with goals, with or without counterfactuals."""
+    """Returns a replay buffer of windows, with or without counterfactuals."""
     goals = WindowGoal(layout, window=WINDOW)
     rb = offline_buffer(
         data,
@@ -208,13 +210,13 @@ for name, counterfactual in (("as recorded", False), ("with counterfactuals", Tr
     print(f"{name}: cabinet closed in {closed:.0%} of the microwave's windows")
 
 # %%
-# One of them beside its recording, where there is OpenGL:
+# A counterfactual window next to its recording, if OpenGL is available:
 
 batch = windows(counterfactual=True).sample()
 rows = batch[(batch["task"] == MICROWAVE) & batch["caiac", "swapped"].any(-1)]
 rows = rows[rows["observation"][:, column] < 0.2]
 made = rows["observation"][0]
-# The robot is never swapped: its joints find the recorded row again.
+# The robot is never swapped: its joints identify the recorded row.
 recorded = data["observation"]
 recorded = recorded[(recorded[:, :9] - made[:9]).abs().sum(-1).argmin()]
 kitchen = KitchenEnv(render_mode="rgb_array")
@@ -230,8 +232,8 @@ figure
 # %%
 # Latent motor plans
 # ------------------
-# An encoder sums a window up as a plan, a decoder turns a plan into actions, and a
-# prior learns which plan leads from a state towards a goal. To act, a plan is drawn
+# An encoder compresses a window into a plan, a decoder maps a plan to actions, and a
+# prior learns which plan leads from a state towards a goal. The policy draws a plan
 # from the prior every ten steps.
 
 STEPS = 1000
@@ -260,21 +262,21 @@ def train(counterfactual: bool) -> LMPModel:
     return model.eval()
 
 
-arms = {}
+models = {}
 for name, counterfactual in (("without", False), ("with", True)):
     print(name, "counterfactuals")
-    arms[name] = train(counterfactual)
+    models[name] = train(counterfactual)
 
 # %%
-# Episodes of each task
-# ---------------------
-# All start with everything closed, and differ in the noise of the simulator. Success
-# means that *all* objects are where the goal wants them; an episode ends there, or
-# after 280 steps.
+# Evaluation
+# ----------
+# All episodes start with everything closed and differ in the noise of the simulator. An
+# episode ends with success when *all* objects are where the goal wants them, and
+# without success after 280 steps.
 
 EPISODES = 5
 strips, titles = [], []
-for name, lmp in arms.items():
+for name, lmp in models.items():
     actor = LMPActor(lmp)
     for task in ("kettle", "microwave"):
         env = make_kitchen_env(task)
@@ -302,7 +304,7 @@ for name, lmp in arms.items():
 folder.cleanup()
 
 # %%
-# The first of the microwave's episodes, without and with counterfactuals:
+# The first microwave episode, without and with counterfactuals:
 
 kitchen = KitchenEnv(render_mode="rgb_array")
 try:
@@ -316,5 +318,5 @@ figure
 
 # %%
 # A few episodes of one short training are an illustration, not a measurement: with
-# another seed this may miss a task. ``make demo`` has more demonstrations, twice the
+# another seed a task may fail. ``make demo`` has more demonstrations, twice the
 # gradient steps with twice the windows, two seeds, and 20 episodes a task.
