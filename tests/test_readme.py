@@ -1,4 +1,4 @@
-"""The code in README.md and docs/usage.md runs, on a small dataset."""
+"""The code in README.md, CONTRIBUTING.md and docs/usage.md runs, on small datasets."""
 
 from __future__ import annotations
 
@@ -245,6 +245,23 @@ def test_rewards_of_transitions(scored: TensorDictBase) -> None:
     run_usage("rb.append_transform(\n    CAIACTransform(layout, threshold", rb=rb)
     batch = rb.sample()
     assert batch["caiac", "counterfactual"].sum() == 4
+
+
+@in_memory
+def test_new_estimator(flat_data: TensorDictBase) -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    (code,) = [b for b in python_blocks(text) if "class MotionInfluence" in b]
+    scope = {
+        "EntityLayout": EntityLayout,
+        "TensorDictBase": TensorDictBase,
+        "torch": torch,
+    }
+    exec(compile(code, "CONTRIBUTING.md", "exec"), scope)
+    rb = offline_buffer(flat_data, batch_size=8)
+    score_buffer(rb, scope["MotionInfluence"](LAYOUT), lookahead=0, progress=False)
+    score = rb.storage[:]["caiac", "score"]
+    moved = (flat_data["next", "observation"] - flat_data["observation"]).abs()
+    torch.testing.assert_close(score[:, 1], moved[:, 3:6].amax(-1))
 
 
 def test_citation_has_the_version() -> None:

@@ -33,7 +33,7 @@ def main() -> None:
     options = parser.parse_args()
     success: dict[str, dict[str, list[float]]] = {}
     for episode in json.loads(options.results.read_text())["results"]:
-        tasks = success.setdefault(episode["arm"], {})
+        tasks = success.setdefault(episode["method"], {})
         tasks.setdefault(episode["task"], []).append(float(episode["success"]))
     plot_success(success, labels=LABELS, title=options.title).savefig(options.figure)
 
