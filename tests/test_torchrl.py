@@ -117,11 +117,11 @@ def test_storage_data_is_the_storage_itself(rb):
     assert rb.storage[0]["a"] == 7
     with pytest.raises(ValueError, match="the donor buffer is empty"):
         fence.storage_data(LazyTensorStorage(4), "the donor buffer")
-    with pytest.raises(TypeError, match="is a ListStorage, wanted one that holds"):
+    with pytest.raises(TypeError, match="is a ListStorage, expected one"):
         fence.storage_data(ListStorage(4))
     tensors = LazyTensorStorage(4)
     tensors.set(range(2), torch.zeros(2))
-    with pytest.raises(TypeError, match="holds a Tensor, wanted a TensorDict"):
+    with pytest.raises(TypeError, match="contains a Tensor, expected a TensorDict"):
         fence.storage_data(tensors)
 
 

@@ -70,16 +70,16 @@ def storage_data(storage: Any, what: str = "the storage") -> TensorDictBase:
     """
     if not isinstance(storage, TensorStorage):
         raise TypeError(
-            f"{what} is a {type(storage).__name__}, wanted one that holds a tensordict "
-            "of all rows: LazyTensorStorage, LazyMemmapStorage or TensorStorage"
+            f"{what} is a {type(storage).__name__}, expected one with a tensordict of "
+            "all rows: LazyTensorStorage, LazyMemmapStorage or TensorStorage"
         )
     if not storage.initialized or not len(storage):
         raise ValueError(f"{what} is empty: extend it with data first")
     data = storage._storage
     if not is_tensor_collection(data):
         raise TypeError(
-            f"{what} holds a {type(data).__name__}, wanted a TensorDict: extend the "
-            "buffer with tensordicts"
+            f"{what} contains a {type(data).__name__}, expected a TensorDict: extend "
+            "the buffer with tensordicts"
         )
     return data
 
@@ -148,7 +148,7 @@ def drop_prefetched(rb: ReplayBuffer) -> None:
 
 
 def file_name(key: str) -> str:
-    """The file name, without suffix, that tensordict gives to an entry."""
+    """The file name, without suffix, that a memory-mapped tensordict gives an entry."""
     name: str = _encode_key_for_filesystem(key)
     return name
 
@@ -171,7 +171,7 @@ def mark_memmap(td: TensorDictBase) -> None:
 
 
 def known_to_be_memmap(td: TensorDictBase) -> bool:
-    """Whether a tensordict is memory-mapped; one that was loaded is told so first."""
+    """Whether a tensordict is memory-mapped; one that was loaded is marked so first."""
     if not td.is_memmap() and memmap_folder(td) is not None:
         leaves = td.values(include_nested=True, leaves_only=True)
         if all(isinstance(leaf, MemoryMappedTensor) for leaf in leaves):

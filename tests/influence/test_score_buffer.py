@@ -383,7 +383,7 @@ def test_rejects_bad_buffers():
         score_buffer(ReplayBuffer(storage=ListStorage(3)), Read())
     rb = ReplayBuffer(storage=LazyTensorStorage(3))
     rb.extend(torch.zeros(3, 2))
-    with pytest.raises(TypeError, match="holds a Tensor"):
+    with pytest.raises(TypeError, match="contains a Tensor"):
         score_buffer(rb, Read())
     rb = ReplayBuffer(storage=LazyTensorStorage(6, ndim=2))
     rb.extend(episodes([6]).reshape(2, 3))

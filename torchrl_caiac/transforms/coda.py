@@ -155,7 +155,7 @@ class CoDATransform(CounterfactualTransform):
 
         Returns:
             torch.Tensor: int64 ``[B, N]``, the component of each entity as a bit mask,
-            0 where it holds the action or a fixed entity.
+            0 where it contains the action or a fixed entity.
         """
         if self._fixed.device != scores.device:
             self._fixed = self._fixed.to(scores.device)

@@ -74,7 +74,7 @@ def _packed(chosen: torch.Tensor) -> torch.Tensor:
 
 
 def _links(graphs: torch.Tensor, threshold: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """What each entity is linked to, ``[R, N]``, and what the action is, ``[R]``."""
+    """What each entity is linked to, ``[R, N]``, and the action, ``[R]``."""
     entities = graphs.shape[-1]
     # NaN, that is not scored, links everything: nothing may be swapped.
     linked = ~(graphs <= threshold)
@@ -85,7 +85,7 @@ def _links(graphs: torch.Tensor, threshold: float) -> tuple[torch.Tensor, torch.
 def _joined(links: torch.Tensor, held: torch.Tensor) -> torch.Tensor:
     """The component of each entity, 0 where it touches ``held``, int64 ``[R, N]``."""
     entities = links.shape[-1]
-    # Warshall's closure of all graphs at once: whoever reaches k reaches what k does.
+    # Warshall's closure of all graphs at once: what reaches k reaches what k does.
     masks = links.t().contiguous() | _bits(entities, links.device).unsqueeze(-1)
     for k in range(entities):
         masks |= -((masks >> k) & 1) & masks[k]
@@ -116,7 +116,7 @@ def components(
 
     Two entities belong together where, in any row of the window and in any direction,
     one influences the other by more than ``threshold``, or by a chain of such links.
-    The action's links only tell which components it holds.
+    The action's links only decide which components contain it.
 
     Args:
         graphs (torch.Tensor): ``[B * window, N + 1, N]``, from the row (the entities,
@@ -128,7 +128,7 @@ def components(
         fixed (torch.Tensor, optional): bool ``[N]``, entities that are never swapped.
 
     Returns:
-        torch.Tensor: int64 ``[B, N]``, the component as a bit mask; 0 where it holds
+        torch.Tensor: int64 ``[B, N]``, the component as a bit mask; 0 where it contains
         the action or a fixed entity.
 
     Examples:
@@ -151,16 +151,16 @@ def components(
 def _shared(
     masks: torch.Tensor, swap_prob: float, generator: torch.Generator | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """What all entities of a component share: leader, random number, being wanted."""
+    """What the entities of a component share: leader, random number, being chosen."""
     leader, device = _leader(masks), masks.device
-    wanted = masks != 0
+    is_chosen = masks != 0
     if swap_prob < 1.0:
         chance = draw_numbers(
             torch.rand, masks.shape, device=device, generator=generator
         )
-        wanted = wanted & (chance < swap_prob).gather(1, leader)
+        is_chosen = is_chosen & (chance < swap_prob).gather(1, leader)
     pick = draw_integers(masks.shape, device=device, generator=generator)
-    return leader, pick.gather(1, leader), wanted
+    return leader, pick.gather(1, leader), is_chosen
 
 
 def draw_batch_components(
@@ -201,8 +201,8 @@ def draw_batch_components(
     windows, entities = masks.shape
     first = windows - num_counterfactual
     tail = masks[first:]
-    leader, pick, wanted = _shared(tail, swap_prob, generator)
-    # The windows of each component lie together, each once: under its leader.
+    leader, pick, is_chosen = _shared(tail, swap_prob, generator)
+    # Sorted, the windows of each component are consecutive, each once, by its leader.
     keys, order = torch.where(_leads(masks), masks, 0).flatten().sort(stable=True)
     places = torch.arange(order.shape[0], device=masks.device)
     place = torch.empty_like(order).scatter_(0, order, places)
@@ -212,8 +212,8 @@ def draw_batch_components(
     # A window is among those of its own component: step over it.
     chosen += chosen >= place.view(windows, entities)[first:].gather(1, leader)
     donors = pick_rows(order, chosen.clamp_max(order.shape[0] - 1)) // entities
-    swapped = wanted & (others > 0)
-    return SwapDraw(donors * window, swapped, (wanted ^ swapped).sum(0))
+    swapped = is_chosen & (others > 0)
+    return SwapDraw(donors * window, swapped, (is_chosen ^ swapped).sum(0))
 
 
 def draw_buffer_components(
@@ -249,22 +249,22 @@ def draw_buffer_components(
         tensor([7, 7])
     """
     device, home = masks.device, index.masks.device
-    _, pick, wanted = _shared(masks, swap_prob, generator)
+    _, pick, is_chosen = _shared(masks, swap_prob, generator)
     place = torch.searchsorted(index.masks, masks.to(home))
     place = place.clamp_max(index.masks.shape[0] - 1)
     found = (pick_rows(index.masks, place) == masks.to(home)).to(device)
     size, offset = pick_rows(index.size, place), pick_rows(index.offset, place)
     chosen = pick.to(home) % size.clamp_min(1) + offset
     donors = pick_rows(index.starts, chosen).to(device, torch.int64)
-    swapped = wanted & found
-    return SwapDraw(donors, swapped, (wanted ^ swapped).sum(0))
+    swapped = is_chosen & found
+    return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0))
 
 
 # --- what may be drawn from a storage ------------------------------------------------
 
 
 def _slid(links: torch.Tensor, window: int) -> torch.Tensor:
-    """All links of each row and the ``window - 1`` rows behind it."""
+    """All links of each row and of the ``window - 1`` rows after it."""
     size = 1
     while size < window:
         step = min(size, window - size)
@@ -283,9 +283,9 @@ def component_starts(
 ) -> ComponentIndex:
     """Finds the rows at which windows start, by the components that they have.
 
-    All rows of such a window belong to one trajectory, and the component holds neither
-    the action nor a fixed entity in any of them. The index takes 4 bytes for each pair
-    of row and component, while it is built 24.
+    All rows of such a window belong to one trajectory, and in none of them the
+    component contains the action or a fixed entity. The index takes 4 bytes for each
+    pair of row and component, and 24 while it is built.
 
     Args:
         graphs (torch.Tensor): ``[T, N + 1, N]``, NaN where a row was not scored.

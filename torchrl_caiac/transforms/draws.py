@@ -129,7 +129,7 @@ def draw_batch_donors(
     """
     windows, entities = free.shape
     first = windows - num_counterfactual
-    wanted = _drawn(free[first:], swap_prob, generator).t()
+    is_chosen = _drawn(free[first:], swap_prob, generator).t()
     free = free.t()
     # rank[n, b]: how many free windows entity n has up to and including window b.
     rank = free.cumsum(1)
@@ -137,16 +137,16 @@ def draw_batch_donors(
     # At least two, of which a remainder can be taken: with fewer there is no donor.
     size = total.clamp_min(2)
     pick = draw_integers(own.shape, device=free.device, generator=generator)
-    # Round the circle of free windows from the one behind the own, never back to it.
+    # Around the circle of free windows, from the one after the own, never back to it.
     place = (pick % (size - 1) + own) % size
     # listed[n, r]: the free window of rank r, from 1; those that are not free end up
     # at 0.
     starts = window_starts(windows, window, free.device).expand(entities, -1)
     listed = rank.new_zeros(entities, windows + 2)
     listed.scatter_(1, rank * free, starts)
-    swapped = wanted & (total > 1)
+    swapped = is_chosen & (total > 1)
     return SwapDraw(
-        listed[:, 1:].gather(1, place).t(), swapped.t(), (wanted ^ swapped).sum(1)
+        listed[:, 1:].gather(1, place).t(), swapped.t(), (is_chosen ^ swapped).sum(1)
     )
 
 
@@ -180,7 +180,7 @@ def draw_buffer_donors(
         tensor([[ True, False]])
     """
     device = free.device
-    wanted = _drawn(free, swap_prob, generator)
+    is_chosen = _drawn(free, swap_prob, generator)
     size = index.size.to(device)
     pick = draw_integers(free.shape, device=device, generator=generator)
     pick = (pick % size.clamp_min(1) + index.offset.to(device)).clamp_max_(
@@ -188,5 +188,5 @@ def draw_buffer_donors(
     )
     found = size > 0
     donors = pick_rows(index.starts, pick).to(device, torch.int64)
-    swapped = wanted & found
-    return SwapDraw(donors, swapped, (wanted ^ swapped).sum(0))
+    swapped = is_chosen & found
+    return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0))

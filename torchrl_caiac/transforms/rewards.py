@@ -154,7 +154,7 @@ def call_reward(
     desired: torch.Tensor,
     like: torch.Tensor,
 ) -> torch.Tensor:
-    """Calls a reward function, and gives its rewards the shape of stored ones.
+    """Calls a reward function, and returns its rewards in the shape of stored ones.
 
     Args:
         reward_fn (callable): ``(next_achieved [B, G], desired [B, G])`` to rewards

@@ -601,7 +601,7 @@ def test_data_that_do_not_fit() -> None:
         goals(td.exclude(("next", "reward")))
     with pytest.raises(KeyError, match=r"read from, .*next.*observation"):
         goals(td.exclude(("next", "observation")))
-    with pytest.raises(ValueError, match=r"wanted \[B\]"):
+    with pytest.raises(ValueError, match=r"expected \[B\]"):
         goals(td.view(3, 3))
     with pytest.raises(ValueError, match=r"\[9, 2\], expected \[9, 1\]: one reward"):
         goals(td.clone().set(("next", "reward"), torch.zeros(9, 2)))

@@ -303,5 +303,5 @@ def test_data_that_do_not_fit() -> None:
         draw(data)
     with pytest.raises(ValueError, match="buffer is empty"):
         goals.expand(torch.tensor([0]), {}, LazyTensorStorage(3))
-    with pytest.raises(TypeError, match="is a ListStorage, wanted one"):
+    with pytest.raises(TypeError, match="is a ListStorage, expected one"):
         goals.expand(torch.tensor([0]), {}, ListStorage(3))

@@ -147,7 +147,7 @@ class FutureGoal(Transform, SampleUnit):
             ]
             if blind:
                 raise ValueError(
-                    f"the layout does not say where the achieved goals of {blind} lie: "
+                    f"the layout does not say where the achieved goals of {blind} are: "
                     "give EntityLayout.from_keys(..., achieved=...)"
                 )
         self.layout = layout

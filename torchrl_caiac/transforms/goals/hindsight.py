@@ -1,4 +1,4 @@
-"""Hindsight goals for transitions: relabelling beside counterfactuals (A.5.2)."""
+"""Hindsight goals for transitions: relabelling real and counterfactual ones (A.5.2)."""
 
 from __future__ import annotations
 
@@ -215,8 +215,8 @@ class HindsightGoal(FutureGoal):
         """
         if self.future > 0 and future is None:
             raise ValueError(
-                f"future goals are wanted for a share of {self.future} of the real "
-                "rows, and none are given"
+                f"a share of {self.future} of the real transitions needs future goals, "
+                "and none are given"
             )
         generator = self.generator if generator is None else generator
         flags = counterfactual.reshape(-1)
@@ -227,16 +227,16 @@ class HindsightGoal(FutureGoal):
         own = torch.arange(rows, device=device)
         # Real rows first: each kind draws among the places that it takes up.
         order = torch.argsort(flags.byte(), stable=True)
-        marked = flags.sum()
-        real = rows - marked
-        place = (pick * torch.where(flags, marked, real)).long() + flags * real
+        flagged = flags.sum()
+        real = rows - flagged
+        place = (pick * torch.where(flags, flagged, real)).long() + flags * real
         goal = pick_rows(order, place) + rows
         if self.future > 0:
             goal = torch.where(flags | (chance >= self.future), goal, own + 2 * rows)
-        wanted = torch.where(
+        is_relabeled = torch.where(
             flags, chance < self.counterfactual, chance < self.future + self.random
         )
-        source = torch.where(wanted, goal, own)
+        source = torch.where(is_relabeled, goal, own)
         return HindsightDraw(source, future)
 
     # --- applying --------------------------------------------------------------------
@@ -272,12 +272,12 @@ class HindsightGoal(FutureGoal):
             goals[key] = torch.cat(parts).index_select(0, draw.source)
         old = stored_reward(td, self.keys.reward)
         reward = call_reward(self.reward_fn, _vector(achieved), _vector(goals), old)
-        anew = relabeled if flags is None else relabeled | flags
+        is_new = relabeled if flags is None else relabeled | flags
         after = {self.layout.next(key): goal for key, goal in goals.items()}
         return {
             **goals,
             **{k: goal for k, goal in after.items() if td.get(k, None) is not None},
-            self.keys.reward: torch.where(anew.view_as(old), reward, old),
+            self.keys.reward: torch.where(is_new.view_as(old), reward, old),
             self.keys.relabeled: relabeled,
         }
 
@@ -321,7 +321,7 @@ class HindsightGoal(FutureGoal):
         goals = self._pending.__dict__.pop("goals", None)
         if tensordict.ndim != 1:
             raise ValueError(
-                f"the batch has shape {list(tensordict.shape)}, wanted [B]: sample "
+                f"the batch has shape {list(tensordict.shape)}, expected [B]: sample "
                 "flat batches of transitions"
             )
         rows = tensordict.shape[0]
@@ -348,7 +348,7 @@ class HindsightGoal(FutureGoal):
         flags = tensordict.get(self.keys.counterfactual, None)
         if flags is not None and flags.shape != (rows, 1):
             raise ValueError(
-                f"{self.keys.counterfactual!r} has shape {list(flags.shape)}, wanted "
+                f"{self.keys.counterfactual!r} has shape {list(flags.shape)}, expected "
                 f"[{rows}, 1]"
             )
         if flags is None:
@@ -363,7 +363,7 @@ class HindsightGoal(FutureGoal):
         That buffer relabels the *first* ``int(her_ratio * B)`` rows of a batch after
         all transforms, from a uniformly drawn later row of the trajectory. With
         ``her_ratio`` at most ``1 - counterfactual_ratio`` these are real rows, and a
-        ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones behind
+        ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones after
         them. The flag in :attr:`relabeled_key` is set for both. That buffer knows
         trajectories by their end flags only, and in TorchRL 0.14 it must not be
         written to once it is full.

@@ -267,8 +267,8 @@ class WindowGoal(FutureGoal):
             )
         if tensordict.get(self.keys.counterfactual, None) is not None:
             raise RuntimeError(
-                "the batch holds counterfactuals already, whose goals would not follow "
-                "the swap: append WindowGoal before the augmentation"
+                "the batch already contains counterfactuals, whose goals would not "
+                "follow the swap: append WindowGoal before the augmentation"
             )
         out = tensordict.copy()
         for key, goal in goals.items():
@@ -299,4 +299,4 @@ def _below(key: NestedKey, *bases: NestedKey) -> tuple[str, ...]:
         start = path(base)
         if parts[: len(start)] == start:
             return parts[len(start) :]
-    raise ValueError(f"{key!r} lies under none of {bases}")
+    raise ValueError(f"{key!r} is below none of {bases}")
