@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchrl_caiac.envs.kitchen import KitchenEnv, KitchenExpert, set_kitchen_start
-from torchrl_caiac.envs.kitchen.inverse_kinematics import rotation_vector
+from torchrl_caiac.envs.kitchen.rotations import rotation_vector
 from torchrl_caiac.envs.kitchen.waypoints import TASKS, Waypoint, tool_rotation
 
 

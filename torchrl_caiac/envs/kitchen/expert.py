@@ -11,11 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchrl_caiac.envs.kitchen.inverse_kinematics import (
-    InverseKinematics,
-    rotation_matrix,
-    rotation_vector,
-)
+from torchrl_caiac.envs.kitchen.inverse_kinematics import InverseKinematics
+from torchrl_caiac.envs.kitchen.rotations import rotation_matrix, rotation_vector
 from torchrl_caiac.envs.kitchen.tasks import SUCCESS_DISTANCE
 from torchrl_caiac.envs.kitchen.waypoints import (
     TASKS,
