@@ -84,6 +84,18 @@ def test_a_dataset_is_replaced_on_request_only(demonstrations, groups, root, wor
         np.testing.assert_array_equal(left.actions, right.actions)
 
 
+@pytest.mark.slow
+def test_two_workers_collect_the_same(demonstrations, groups, tmp_path):
+    dataset, _ = create_kitchen_demonstrations(
+        demonstrations=groups, root=tmp_path, workers=2, progress=False
+    )
+    for left, right in zip(
+        dataset.iterate_episodes(), demonstrations.iterate_episodes(), strict=True
+    ):
+        np.testing.assert_array_equal(left.actions, right.actions)
+        np.testing.assert_array_equal(left.infos["qpos"], right.infos["qpos"])
+
+
 def test_bad_input(root, tmp_path):
     with pytest.raises(FileNotFoundError, match="no Minari dataset"):
         open_minari("kitchen/none-v0", root)
