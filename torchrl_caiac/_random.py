@@ -1,4 +1,4 @@
-"""Random numbers on one device from generators of another."""
+"""Random numbers on one device from a generator of another."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ def draw_numbers(
     generator: torch.Generator | None = None,
     **kwargs: Any,
 ) -> torch.Tensor:
-    """Random numbers where they are needed, whatever the generator's device.
+    """Draws random numbers for one device with a generator of any device.
 
-    A generator draws on its own device only, so that one of the CPU gives the same
-    numbers on all devices. They are copied without waiting for an accelerator.
+    A generator draws on its own device, so a generator of the CPU gives the same
+    numbers on all devices. They are copied without synchronising an accelerator.
 
     Args:
-        kind (callable): what makes them, such as :func:`torch.rand`.
-        *args: of ``kind``, such as a shape.
+        kind (callable): the random function, such as :func:`torch.rand`.
+        *args (Any): its arguments, such as a shape.
 
     Keyword Args:
-        device (torch.device): where they are needed.
-        generator (torch.Generator, optional): where they come from; the global one of
-            the device by default.
-        **kwargs: more of ``kind``, such as ``dtype``.
+        device (torch.device): the device of the result.
+        generator (torch.Generator, optional): the generator. Defaults to ``None``: the
+            global one of ``device``.
+        **kwargs (Any): further arguments of ``kind``, such as ``dtype``.
 
     Returns:
-        torch.Tensor: on ``device``.
+        torch.Tensor: the numbers.
 
     Examples:
         >>> import torch
@@ -57,17 +57,18 @@ def draw_integers(
     device: torch.device,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Random integers so large that their remainders are uniform for all purposes.
+    """Draws random integers so large that their remainders are practically uniform.
 
     Args:
         shape (sequence of int): the shape.
 
     Keyword Args:
-        device (torch.device): where they are needed.
-        generator (torch.Generator, optional): where they come from.
+        device (torch.device): the device of the result.
+        generator (torch.Generator, optional): the generator. Defaults to ``None``: the
+            global one of ``device``.
 
     Returns:
-        torch.Tensor: int64, from 0 to 2**62.
+        torch.Tensor: the integers, int64, at least 0 and below ``2**62``.
 
     Examples:
         >>> import torch

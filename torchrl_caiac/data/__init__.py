@@ -1,4 +1,4 @@
-"""Collecting, loading and storing demonstrations."""
+"""Collecting episodes, and loading, mixing and storing transitions."""
 
 from __future__ import annotations
 

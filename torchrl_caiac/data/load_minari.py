@@ -76,13 +76,13 @@ def load_minari(
 
     Examples:
         >>> import os, tempfile
+        >>> from unittest.mock import patch
         >>> import minari
         >>> import numpy as np
         >>> from gymnasium.spaces import Box
         >>> from minari.data_collector import EpisodeBuffer
         >>> from torchrl_caiac.data import load_minari
         >>> folder = tempfile.TemporaryDirectory()
-        >>> os.environ["MINARI_DATASETS_PATH"] = folder.name
         >>> episode = EpisodeBuffer(
         ...     observations=np.zeros((6, 3)),
         ...     actions=np.zeros((5, 2)),
@@ -90,18 +90,18 @@ def load_minari(
         ...     terminations=np.zeros(5, bool),
         ...     truncations=np.zeros(5, bool),
         ... )
-        >>> dataset = minari.create_dataset_from_buffers(
-        ...     "example/zeros-v0",
-        ...     [episode, episode],
-        ...     observation_space=Box(-1, 1, (3,)),
-        ...     action_space=Box(-1, 1, (2,)),
-        ... )
+        >>> with patch.dict(os.environ, MINARI_DATASETS_PATH=folder.name):
+        ...     dataset = minari.create_dataset_from_buffers(
+        ...         "example/zeros-v0",
+        ...         [episode, episode],
+        ...         observation_space=Box(-1, 1, (3,)),
+        ...         action_space=Box(-1, 1, (2,)),
+        ...     )
         >>> data = load_minari(dataset, f"{folder.name}/data", progress=False)
         >>> data["episode"]
         MemoryMappedTensor([0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
         >>> data["next", "observation"].shape
         torch.Size([10, 3])
-        >>> del os.environ["MINARI_DATASETS_PATH"]
         >>> folder.cleanup()
     """
     import minari
@@ -228,7 +228,7 @@ def _columns(states: Mapping[str, Any], columns: Sequence[int], where: str) -> A
     if min(columns) < 0 or max(columns) >= observation.shape[1]:
         raise ValueError(
             f"columns range from {min(columns)} to {max(columns)}, but {where} has "
-            f"{observation.shape[1]} columns"
+            f"{observation.shape[1]} columns: correct columns="
         )
     return observation[:, list(columns)]
 

@@ -103,8 +103,7 @@ def mix_trajectories(
         (100, tensor(0.3000))
     """
     check_free(path, overwrite)
-    new = (source_key, source_trajectory_key)
-    _check_sources(sources, new)
+    _check_sources(sources, (source_key, source_trajectory_key))
     indices = [
         _index(source, trajectory_key, number) for number, source in enumerate(sources)
     ]
@@ -182,9 +181,9 @@ def _draw_trajectories(
     ]
     end = min(place[-1] for place in places)
     order = np.concatenate([place[:-1] for place in places])
-    who = np.repeat(np.arange(len(counts)), counts)
+    source = np.repeat(np.arange(len(counts)), counts)
     # Each source has a seed of its own, so the size of another changes nothing.
-    which = np.concatenate(
+    trajectory = np.concatenate(
         [
             np.random.default_rng([seed, number]).permutation(count)
             for number, count in enumerate(counts)
@@ -207,19 +206,19 @@ def _draw_trajectories(
             "trajectory: raise it"
         )
     first = np.argsort(order, kind="stable")[:taken]
-    return np.stack([who[first], which[first]], 1)
+    return np.stack([source[first], trajectory[first]], 1)
 
 
 def _locate(indices: Sequence[TrajectoryIndex], picks: np.ndarray) -> _Rows:
-    who, which = torch.from_numpy(picks).unbind(1)
-    starts, lengths = torch.empty_like(who), torch.empty_like(who)
-    for source, index in enumerate(indices):
-        mine = who == source
-        starts[mine] = index.starts.cpu()[which[mine]]
-        lengths[mine] = index.lengths.cpu()[which[mine]]
-    number = torch.arange(len(who)).repeat_interleave(lengths)
+    source, trajectory = torch.from_numpy(picks).unbind(1)
+    starts, lengths = torch.empty_like(source), torch.empty_like(source)
+    for position, index in enumerate(indices):
+        own = source == position
+        starts[own] = index.starts.cpu()[trajectory[own]]
+        lengths[own] = index.lengths.cpu()[trajectory[own]]
+    number = torch.arange(len(source)).repeat_interleave(lengths)
     step = torch.arange(len(number)) - (lengths.cumsum(0) - lengths)[number]
-    return _Rows(number, who[number], starts[number] + step)
+    return _Rows(number, source[number], starts[number] + step)
 
 
 def _fill(
@@ -238,14 +237,11 @@ def _fill(
         places = (rows.source == number).nonzero().squeeze(1)
         taken = rows.row[places]
         for key in keys:
-            same = key_path(key) == key_path(trajectory_key)
-            leaf, target = (
-                source.get(key),
-                mixed.get(source_trajectory_key if same else key),
-            )
-            target[places.to(target.device)] = leaf[taken.to(leaf.device)].to(
-                target.device
-            )
+            is_id = key_path(key) == key_path(trajectory_key)
+            leaf = source.get(key)
+            target = mixed.get(source_trajectory_key if is_id else key)
+            values = leaf[taken.to(leaf.device)].to(target.device)
+            target[places.to(target.device)] = values
 
 
 def _index(
@@ -296,7 +292,7 @@ def _check_sources(sources: Sequence[TensorDictBase], new: Sequence[NestedKey]) 
         if differ:
             raise ValueError(
                 f"leaves of source 0 and source {number} differ in dtype or in the "
-                f"shape after the batch dimension: {differ}"
+                f"shape after the batch dimension: {differ}; convert them"
             )
         for key in new:
             if source.get(key, None) is not None:
