@@ -2,6 +2,7 @@
 PYTHON ?= python3
 WORKERS ?= 2
 DEVICE ?= cpu
+SIZE := $(if $(QUICK),size=quick)
 INFLUENCE ?= $(if $(QUICK),outputs/influence_quick,docs/results)
 
 VENV := .venv
@@ -54,18 +55,15 @@ lint: setup ## check style, formatting, spelling and types
 	$(BIN)/python -m mypy
 
 demo: setup ## the motivating experiment in the kitchen (QUICK=1: a smoke run)
-	$(BIN)/python examples/franka_kitchen/demo.py $(if $(QUICK),quick=true)
+	@$(BIN)/python examples/study.py study=demo $(SIZE)
 
-fetch-push: setup ## the comparison of arms on Fetch-Push (QUICK=1: a smoke run)
-	$(BIN)/python examples/fetch_push/study.py $(if $(QUICK),quick=true)
+fetch-push: setup ## the comparison of methods on Fetch-Push (QUICK=1: a smoke run)
+	@$(BIN)/python examples/study.py study=fetch_push $(SIZE)
 
 influence: setup ## compare influence estimators (QUICK=1: a smoke run)
-	$(BIN)/python examples/fetch_push/compare_influence.py \
-	    study.influence=$(INFLUENCE) $(if $(QUICK),quick=true)
-	$(BIN)/python examples/franka_kitchen/compare_influence.py \
-	    demo.influence=$(INFLUENCE) $(if $(QUICK),quick=true)
-	$(BIN)/python examples/franka_kitchen/compare_influence.py experiment=all_tasks \
-	    demo.influence=$(INFLUENCE) $(if $(QUICK),quick=true)
+	@for env in fetch_push kitchen kitchen_all_tasks; do \
+	    $(BIN)/python examples/compare_influence.py env=$$env \
+	        publish=$(INFLUENCE) $(SIZE); done
 
 bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'

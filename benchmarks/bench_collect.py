@@ -1,10 +1,10 @@
 """Fetch-Push episodes a second with one and with two processes, and how busy they are.
 
 Run with ``pytest benchmarks/bench_collect.py`` (``make bench``). What is timed is
-``create_fetch_push_expert`` as ``examples/fetch_push/collect.py`` calls it: episodes of
-100 steps with simulator states, from the start of the processes (some seconds each, for
-imports) to the Minari dataset. The busy share is the processor time of all processes
-over twice the time that passed; jobs beside it lower it.
+``create_fetch_push_expert`` as ``examples/environments/fetch_push.py`` calls it:
+episodes of 100 steps with simulator states, from the start of the processes (some
+seconds each, for imports) to the Minari dataset. The busy share is the processor time
+of all processes over twice the time that passed; jobs next to it lower it.
 """
 
 from __future__ import annotations

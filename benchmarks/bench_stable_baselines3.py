@@ -11,7 +11,7 @@ targets; networks of 3 x 256 read 52 numbers (and the critics 4 of the action); 
   goals from the future of their own episode; what is timed is ``train()``. Its
   observation holds the 34 state columns and the 6 of the cubes relative to the
   gripper, beside achieved and desired goals of 6 each.
-- Ours: :class:`GoalConditionedTD3Loss` as ``examples/fetch_push/train.py`` uses it,
+- Ours: :class:`GoalConditionedTD3Loss` as ``examples/learners/td3.py`` uses it,
   with half of the rows counterfactual (``CAIACTransform``), goals relabelled and
   rewards made anew (``HindsightGoal``), the relative features (12 columns)
   computed in every pass; four batches are sampled at once.

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import csv
 import math
-from functools import partial
 from itertools import product
 
 import pytest
@@ -16,12 +14,8 @@ from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.evaluation import (
     Candidate,
     compare_influence,
-    paper_candidates,
-    publish_comparison,
     swap_shares,
 )
-from torchrl_caiac.influence import CAI, DistanceInfluence
-from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 
 NAMES = ("arm", "cup", "box")
 LAYOUT = EntityLayout({"arm": [0], "cup": [1], "box": [2]}, fixed=["arm"])
@@ -168,47 +162,3 @@ def test_table_of_several_estimators():
     # Of the nine links between different nodes, only those of the action exist.
     everything = (data["observation"] > 0.5).float().mean().item()
     assert graph["density"] == pytest.approx(everything / 3)
-
-
-def test_the_paper_s_estimators_and_their_thresholds():
-    rule = partial(DistanceInfluence, LAYOUT, {n: [i] for i, n in enumerate(NAMES)})
-    found = paper_candidates(
-        CAI(GaussianWorldModel(LAYOUT, 1, (8,)), num_actions=4),
-        TransformerWorldModel(LAYOUT, 1, layers=1, heads=2, width=8),
-        rule,
-        rule(action_only=True),
-        threshold=0.05,
-        attention_threshold=0.2,
-        smoothing=3,
-        fit_seconds=(1.0, 2.0),
-    )
-    thresholds = {name: c.transform.threshold for name, c in found.items()}
-    assert list(thresholds.values()) == [0.05, 0.2, 0.2, 0.5, 0.5, 0.5]
-    smoothing = {name: (c.smoothing, c.fit_seconds) for name, c in found.items()}
-    assert smoothing["caiac"] == (3, 1.0)
-    assert smoothing["coda"] == smoothing["coda_action"] == (3, 2.0)
-    assert smoothing["oracle"][0] == 1
-    # Each transform reads what its estimator scores.
-    table = compare_influence(rows(), rows()["observation"] > 0.5, found)
-    assert {row["estimator"] for row in table} == set(found)
-
-
-def test_experiments_share_the_published_table(tmp_path):
-    truth = rows()["observation"] > 0.5
-    candidates = {"row": Candidate(Observed(), CAIACTransform(LAYOUT, 0.5))}
-    table = compare_influence(rows(), truth, candidates, progress=False)
-    for experiment in ("push", "kitchen", "push"):
-        publish_comparison(tmp_path, table, experiment=experiment)
-    with (tmp_path / "influence.csv").open() as file:
-        found = [(r["experiment"], r["entity"]) for r in csv.DictReader(file)]
-    assert found == list(product(("push", "kitchen"), ("all", "cup", "box")))
-    assert (tmp_path / "influence.png").stat().st_size > 1000
-    lines = (tmp_path / "influence.txt").read_text().splitlines()
-    assert [line.split()[0] for line in lines if line.strip()] == [
-        *("push", "θ", "row"),
-        *("kitchen", "θ", "row"),
-    ]
-    assert lines[2].split()[1:3] == ["0.5", "1"]  # θ and the AUC
-    (tmp_path / "influence.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ValueError, match=r"columns \['a', 'b'\]"):
-        publish_comparison(tmp_path, table, experiment="push")

@@ -55,7 +55,6 @@ CORE = (
     "torchrl_caiac.checkpoint",
     "torchrl_caiac.data",
     "torchrl_caiac.evaluation",
-    "torchrl_caiac.experiments",
     "torchrl_caiac.fit",
     "torchrl_caiac.influence",
     "torchrl_caiac.modules",

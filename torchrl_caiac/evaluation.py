@@ -5,26 +5,18 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_caiac._files import whole_file
 from torchrl_caiac.data.offline_buffer import offline_buffer
-from torchrl_caiac.experiments import update_csv
-from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.metrics import influence_report
 from torchrl_caiac.influence.score_buffer import score_buffer
 
 if TYPE_CHECKING:
-    from torchrl_caiac.influence.cai import CAI
-    from torchrl_caiac.influence.distance import DistanceInfluence
-    from torchrl_caiac.influence.truth import SimulatorInfluence
-    from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
     from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 
 __all__ = [
@@ -32,8 +24,6 @@ __all__ = [
     "Candidate",
     "SwapShares",
     "compare_influence",
-    "paper_candidates",
-    "publish_comparison",
     "swap_shares",
 ]
 
@@ -69,80 +59,6 @@ class Candidate(NamedTuple):
     transform: CounterfactualTransform
     smoothing: int = 1
     fit_seconds: float = math.nan
-
-
-def paper_candidates(
-    cai: CAI,
-    transformer: TransformerWorldModel,
-    distance: Callable[..., DistanceInfluence],
-    simulator: SimulatorInfluence,
-    *,
-    threshold: float,
-    attention_threshold: float,
-    smoothing: int = 1,
-    fit_seconds: tuple[float, float] = (math.nan, math.nan),
-) -> dict[str, Candidate]:
-    """The estimators that the paper compares, the distance rule, and the simulator.
-
-    Args:
-        cai (CAI): of a fitted world model; its layout is that of all transforms.
-        transformer (TransformerWorldModel): a fitted one, for CoDA and CoDA-action.
-        distance (callable): makes the rule, given ``action_only``.
-        simulator (SimulatorInfluence): the truth, by as many actions as an experiment
-            asks it for.
-
-    Keyword Args:
-        threshold (float): θ of CAI.
-        attention_threshold (float): θ of the attention's scores.
-        smoothing (int): of learned scores. Defaults to 1.
-        fit_seconds (tuple of float): of the model of ``cai`` and of the transformer.
-
-    Returns:
-        dict of str to Candidate: ``"caiac"``, ``"coda"``, ``"coda_action"``,
-        ``"distance"``, ``"distance_action"`` and ``"oracle"``.
-
-    Examples:
-        >>> from functools import partial
-        >>> from torchrl_caiac import EntityLayout
-        >>> from torchrl_caiac.influence import CAI, DistanceInfluence
-        >>> from torchrl_caiac.evaluation import paper_candidates
-        >>> from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
-        >>> layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
-        >>> rule = partial(DistanceInfluence, layout, {"arm": [0], "cup": [1]})
-        >>> found = paper_candidates(
-        ...     CAI(GaussianWorldModel(layout, 1, (8,))),
-        ...     TransformerWorldModel(layout, 1, width=8),
-        ...     rule,
-        ...     rule(action_only=True),  # here in the place of a simulator
-        ...     threshold=0.05,
-        ...     attention_threshold=0.2,
-        ... )
-        >>> found["coda"].transform.threshold
-        0.2
-    """
-    from torchrl_caiac.transforms import CAIACTransform, CoDATransform
-
-    layout = cai.layout
-    gaussian, attention = ((smoothing, seconds) for seconds in fit_seconds)
-    return {
-        "caiac": Candidate(cai, CAIACTransform(layout, threshold), *gaussian),
-        "coda": Candidate(
-            AttentionInfluence(transformer),
-            CoDATransform(layout, attention_threshold),
-            *attention,
-        ),
-        "coda_action": Candidate(
-            AttentionInfluence(transformer, action_only=True),
-            CAIACTransform(layout, attention_threshold),
-            *attention,
-        ),
-        # From here on scores are 0 or 1.
-        "distance": Candidate(distance(action_only=False), CoDATransform(layout, 0.5)),
-        "distance_action": Candidate(
-            distance(action_only=True), CAIACTransform(layout, 0.5)
-        ),
-        "oracle": Candidate(simulator, CAIACTransform(layout, 0.5)),
-    }
 
 
 class SwapShares(NamedTuple):
@@ -348,78 +264,6 @@ def compare_influence(
         )
         rows += entities
     return rows
-
-
-def publish_comparison(
-    folder: str | Path, rows: Sequence[Mapping[str, Any]], *, experiment: str
-) -> None:
-    """Writes a comparison to ``influence.csv``, and draws ``influence.png``.
-
-    ``influence.txt`` has the rows over all entities, to be read. Several experiments
-    share the files: each call replaces the rows of its own.
-
-    Args:
-        folder (str or Path): where the files are.
-        rows (sequence of dict): of :func:`compare_influence`.
-
-    Keyword Args:
-        experiment (str): the name of the data, the table's first column.
-
-    Examples:
-        >>> import os, tempfile
-        >>> from torchrl_caiac.evaluation import publish_comparison
-        >>> row = {"estimator": "caiac", "entity": "all", "auc": 0.9}
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     publish_comparison(folder, [row], experiment="pushing")
-        ...     sorted(os.listdir(folder))
-        ['influence.csv', 'influence.png', 'influence.txt']
-    """
-    from torchrl_caiac.plotting import plot_comparison
-
-    table = update_csv(
-        Path(folder) / "influence.csv", rows, COLUMNS, experiment=experiment
-    )
-    with whole_file(Path(folder) / "influence.txt") as partial:
-        partial.write_text(_table(table))
-    with whole_file(Path(folder) / "influence.png") as partial:
-        plot_comparison(table).savefig(partial, dpi=150)
-
-
-# What is read of a comparison, and its heads.
-_READ = {
-    "threshold": "θ",
-    "auc": "AUC",
-    "true_positive_rate": "TPR",
-    "false_positive_rate": "FPR",
-    "density": "links > θ",
-    "rows_swapped": "rows swapped",
-    "infeasible": "infeasible",
-    "fit_seconds": "fit, s",
-    "score_seconds": "score, s",
-}
-
-
-def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    """The rows over all entities, one experiment after another."""
-    lines: list[str] = []
-    experiment = None
-    for row in rows:
-        if row["entity"] != "all":
-            continue
-        if row["experiment"] != experiment:
-            experiment = row["experiment"]
-            heads = "".join(f"{head:>14}" for head in _READ.values())
-            lines += ["", experiment, f"  {'':<16}{heads}"]
-        values = (float(row[name]) if row[name] else None for name in _READ)
-        cells = "".join(f"{_number(value):>14}" for value in values)
-        lines.append(f"  {row['estimator']:<16}{cells}")
-    return "\n".join(lines[1:]) + "\n"
-
-
-def _number(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
 
 
 def _cpu_seconds() -> float:

@@ -1,0 +1,1 @@
+"""Environments of the examples, one module each."""

@@ -1,0 +1,167 @@
+"""What an environment is to the steps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.data import load_transitions, offline_buffer
+from torchrl_caiac.influence import score_buffer
+
+__all__ = ["Environment", "Evaluation"]
+
+
+class Evaluation(NamedTuple):
+    """The episodes that one policy played.
+
+    Attributes:
+        method (str): the name of the method.
+        seed (int): of the run.
+        step (int): gradient steps of the policy.
+        fraction (float): of the data that the run learnt from.
+        episodes (list of dict): one dictionary an episode, as
+            :meth:`Environment.play` returns them.
+    """
+
+    method: str
+    seed: int
+    step: int
+    fraction: float
+    episodes: list[dict[str, Any]]
+
+
+class Environment(ABC):
+    """Data, simulator and evaluation of an environment.
+
+    A subclass in a module of this folder, with a file ``conf/env/<name>.yaml`` that has
+    its settings, is all that a new environment takes.
+
+    Args:
+        settings (DictConfig): ``cfg.env``.
+        out (Path): the folder that all steps write.
+
+    Keyword Args:
+        workers (int): processes that collect data and query the simulator.
+    """
+
+    layout: EntityLayout
+    action_dim: int
+    predicted: Mapping[str, Sequence[int]] | None = None
+    """The columns that world models predict; ``None`` for all."""
+    goal_reference: str | None = None
+    """The entity that networks see positions relative to; ``None`` for none."""
+    reward_fn: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None
+    """Rewards of achieved and desired goals, -1 or 0; ``None`` where it has none."""
+    data_name: ClassVar[str] = "data"
+    """What the data are, for the list of stages."""
+    success_key: ClassVar[str] = "success"
+    """What counts as the success of an episode, see :meth:`play`."""
+
+    def __init__(self, settings: DictConfig, out: Path, *, workers: int = 1) -> None:
+        self.settings = settings
+        self.out = out
+        self.workers = workers
+
+    @property
+    def folder(self) -> Path:
+        """The folder of all that depends on the data to learn from."""
+        return self.out
+
+    @abstractmethod
+    def collect(self, *, progress: bool = False) -> None:
+        """Collects what is missing of the data."""
+
+    @abstractmethod
+    def rows(self) -> TensorDictBase:
+        """The transitions to learn from, ``[T]``, memory-mapped; scores are added."""
+
+    def goal_rows(self) -> TensorDictBase:
+        """The same transitions with desired goals and rewards."""
+        return self.rows()
+
+    def model_rows(self) -> list[TensorDictBase]:
+        """The data sets that world models are fitted to."""
+        return [self.rows()]
+
+    def held_out(self) -> TensorDictBase:
+        """Transitions that nothing learns from, memory-mapped, to check the scores."""
+        return load_transitions(self.out / "held_out")
+
+    @abstractmethod
+    def simulator(self, num_actions: int) -> Any:
+        """The estimator that queries the simulator with some actions a state."""
+
+    @abstractmethod
+    def distance_rule(self, *, action_only: bool) -> Any:
+        """The estimator that calls entities linked that are close to each other."""
+
+    def ground_truth(self, *, progress: bool = False) -> torch.Tensor:
+        """What the action can move in the held-out states, bool ``[T, N]``."""
+        held_out = self.held_out()
+        score_buffer(
+            offline_buffer(held_out, batch_size=1),
+            self.simulator(self.settings.truth.actions),
+            key=("oracle", "score"),
+            batch_size=self.settings.truth.batch_size,
+            lookahead=0,
+            progress=progress,
+        )
+        return held_out["oracle", "score"] > 0.5
+
+    @abstractmethod
+    def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
+        """Plays the episodes of an evaluation.
+
+        Args:
+            actor (TensorDictModule): the policy.
+            seed (int): of the run.
+            folder (Path): for figures of episodes, if any.
+
+        Returns:
+            list of dict: one dictionary an episode, JSON values.
+        """
+
+    @abstractmethod
+    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
+        """The lines of the table of results that belong to one policy."""
+
+    @abstractmethod
+    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
+        """The success of one method: groups of bars, each with independent results."""
+
+    @abstractmethod
+    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
+        """The lines that report the success of all methods."""
+
+    @abstractmethod
+    def answer(self, evaluations: Sequence[Evaluation]) -> str:
+        """The answer of a study in one line."""
+
+    def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
+        """Draws figures of its own. Defaults to none.
+
+        Args:
+            folder (Path): where they are written.
+            name (str): of the study, with which files begin.
+
+        Keyword Args:
+            threshold (float): θ of CAIAC.
+
+        Returns:
+            list of str: remarks, for example on figures that were left out.
+        """
+        return []
+
+
+def compare_methods(shares: Mapping[str, str]) -> str:
+    """Joins the results of methods: ``"0/40 without, 40/40 with counterfactuals"``."""
+    if {"none", "caiac"} <= shares.keys():
+        return f"{shares['none']} without, {shares['caiac']} with counterfactuals"
+    return ", ".join(f"{share} {name}" for name, share in shares.items())

@@ -1,0 +1,238 @@
+"""Fetch-Push with two cubes: episodes of an expert and random ones (A.6.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from environments.base import Environment, Evaluation, compare_methods
+from torchrl_caiac.data import load_minari, load_transitions, mix_trajectories
+from torchrl_caiac.envs.fetch_push import (
+    FetchPushCubes,
+    FetchPushTruth,
+    create_fetch_push_expert,
+    create_fetch_push_random,
+    fetch_push_layout,
+    fetch_push_reward,
+)
+from torchrl_caiac.influence import DistanceInfluence, SimulatorInfluence
+from torchrl_caiac.plotting import bootstrap_interval
+
+__all__ = ["FetchPush"]
+
+LAYOUT = fetch_push_layout(2)
+MEASURES = ("full", "cube0", "cube1", "final")
+MAKERS = {"expert": create_fetch_push_expert, "random": create_fetch_push_random}
+
+
+class FetchPush(Environment):
+    """Two cubes, and a part of the data to learn from, ``env.fraction``.
+
+    ``held_out`` are episodes with other seeds, which only check the scores.
+    """
+
+    layout = LAYOUT
+    action_dim = 4
+    # The positions of the gripper and its fingers, and of the cubes.
+    predicted = {  # noqa: RUF012
+        name: LAYOUT.columns[name][:n]
+        for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
+    }
+    goal_reference = "gripper"
+    reward_fn = staticmethod(fetch_push_reward)
+    data_name = "episodes"
+    success_key = "full"
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the fraction of the data."""
+        return self.out / f"fraction-{self.settings.fraction:g}"
+
+    def collect(self, *, progress: bool = False) -> None:
+        """Collects what is missing of the datasets, and mixes the transitions."""
+        settings, out = self.settings.collect, self.out
+        total = settings.expert + settings.random
+        shares = [settings.expert / total, settings.random / total]
+        held_out = round(settings.held_out * shares[0])
+        parts = {
+            "expert": (settings.expert, settings.seed),
+            "random": (settings.random, settings.seed + 1),
+            "held_out_expert": (held_out, settings.seed + 2),
+            "held_out_random": (settings.held_out - held_out, settings.seed + 3),
+        }
+        for name, (episodes, seed) in parts.items():
+            if (out / name).exists():
+                continue
+            dataset = MAKERS[name.removeprefix("held_out_")](
+                f"fetch-push-2/{name.replace('_', '-')}-v0",
+                episodes=episodes,
+                steps=settings.steps,
+                root=out / "minari",
+                work=out / "work",
+                seed=seed,
+                workers=self.workers,
+                overwrite=True,
+                progress=progress,
+            )
+            load_minari(dataset, out / name, infos=["simulator"], progress=progress)
+        for path, names, fraction in (
+            (self.folder / "rows", ("expert", "random"), self.settings.fraction),
+            (out / "held_out", ("held_out_expert", "held_out_random"), 1.0),
+        ):
+            if not path.exists():
+                mix_trajectories(
+                    [load_transitions(out / name) for name in names],
+                    shares=shares if fraction < 1 else None,
+                    fraction=fraction,
+                    seed=settings.seed,
+                    path=path,
+                )
+
+    def rows(self) -> TensorDictBase:
+        """The fraction of the expert's and the random episodes."""
+        return load_transitions(self.folder / "rows")
+
+    def simulator(self, num_actions: int) -> SimulatorInfluence:
+        """The simulator as an estimator."""
+        return SimulatorInfluence(
+            FetchPushTruth,
+            state_key=("info", "simulator"),
+            num_actions=num_actions,
+            threshold=self.settings.truth.threshold,
+            # One worker is this process.
+            num_workers=self.workers if self.workers > 1 else 0,
+        )
+
+    def distance_rule(self, *, action_only: bool) -> DistanceInfluence:
+        """The rule of distance between the gripper and the cubes."""
+        positions = {name: LAYOUT.columns[name][:3] for name in LAYOUT.names}
+        return DistanceInfluence(LAYOUT, positions, action_only=action_only)
+
+    def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
+        """Plays episodes from the same starts for all runs."""
+        settings = self.settings.evaluate
+        return play(
+            actor,
+            episodes=settings.episodes,
+            steps=self.settings.collect.steps,
+            seed=settings.seed,
+        )
+
+    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
+        """One line a policy: the shares of its episodes."""
+        return [{name: _mean(evaluation, name) for name in MEASURES}]
+
+    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
+        """Mean success of each run, by the fraction of the data."""
+        return {
+            f"{100 * fraction:g} % of the data": _by_seed(
+                [e for e in evaluations if e.fraction == fraction], "full"
+            )
+            for fraction in dict.fromkeys(e.fraction for e in evaluations)
+        }
+
+    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
+        """Success by method, and CAIAC's difference to the others."""
+        steps = sorted({e.step for e in evaluations})
+        lines = [
+            f"success in {self.settings.evaluate.episodes} episodes, mean of the "
+            f"policies from step {steps[0]} to {steps[-1]}, 95 % interval over seeds",
+            f"  {'':<14}" + "".join(f"{name:>22}" for name in MEASURES),
+        ]
+        by_method = _by_method(evaluations)
+        for method, mine in by_method.items():
+            cells = []
+            for measure in MEASURES:
+                values = _by_seed(mine, measure)
+                low, high = bootstrap_interval(values)
+                cells.append(f"{np.mean(values):.3f} [{low:.3f}, {high:.3f}]")
+            lines.append(f"  {method:<14}" + "".join(f"{cell:>22}" for cell in cells))
+        if "caiac" in by_method and len(by_method) > 1:
+            lines += [
+                "",
+                "full success of caiac minus that of, 95 % interval over starts",
+            ]
+            own = _by_start(by_method.pop("caiac"))
+            for method, mine in by_method.items():
+                difference = own - _by_start(mine)
+                low, high = bootstrap_interval(difference)
+                lines.append(
+                    f"  {method:<14}{difference.mean():>+7.3f} [{low:.3f}, {high:.3f}]"
+                )
+        return lines
+
+    def answer(self, evaluations: Sequence[Evaluation]) -> str:
+        """The share of episodes in which both cubes reach their goals."""
+        shares = {
+            method: f"{100 * np.mean(_by_seed(mine, 'full')):.1f} %"
+            for method, mine in _by_method(evaluations).items()
+        }
+        return f"both cubes at their goals: {compare_methods(shares)}"
+
+
+def play(actor: Any, *, episodes: int, steps: int, seed: int) -> list[dict[str, bool]]:
+    """Plays episodes at the same time, from the starts that the seed gives.
+
+    Returns:
+        list of dict: for each episode whether all cubes were at their goals at some
+        step (``full``) and at the last one (``final``), and whether each cube was at
+        some step.
+    """
+    envs = [FetchPushCubes(2, max_episode_steps=steps) for _ in range(episodes)]
+    states = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
+    reached = np.zeros((steps, episodes, 2), dtype=np.bool_)
+    keys = [key for key in actor.in_keys if key in states[0]]
+    # What a policy carries from step to step, a plan for example.
+    carried = TensorDict({"is_init": torch.ones(episodes, 1, dtype=torch.bool)})
+    carried.batch_size = [episodes]
+    for step in range(steps):
+        inputs = {k: torch.from_numpy(np.stack([s[k] for s in states])) for k in keys}
+        with torch.no_grad():
+            output = actor(TensorDict(inputs, [episodes]).update(carried))
+        actions = output["action"].numpy()
+        carried = output.get("next", TensorDict({}, [episodes]))
+        for i, env in enumerate(envs):
+            states[i], _, _, _, info = env.step(actions[i])
+            reached[step, i] = info["cube_success"]
+    for env in envs:
+        env.close()
+    together = reached.all(-1)
+    return [
+        {
+            "full": bool(together[:, i].any()),
+            "cube0": bool(reached[:, i, 0].any()),
+            "cube1": bool(reached[:, i, 1].any()),
+            "final": bool(together[-1, i]),
+        }
+        for i in range(episodes)
+    ]
+
+
+def _mean(evaluation: Evaluation, measure: str) -> float:
+    return float(np.mean([episode[measure] for episode in evaluation.episodes]))
+
+
+def _by_method(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
+    grouped: dict[str, list[Evaluation]] = {}
+    for evaluation in evaluations:
+        grouped.setdefault(evaluation.method, []).append(evaluation)
+    return grouped
+
+
+def _by_seed(evaluations: Sequence[Evaluation], measure: str) -> list[float]:
+    """Means over the policies of each run."""
+    return [
+        float(np.mean([_mean(e, measure) for e in evaluations if e.seed == seed]))
+        for seed in sorted({e.seed for e in evaluations})
+    ]
+
+
+def _by_start(evaluations: Sequence[Evaluation]) -> np.ndarray:
+    """Full success from each start, mean over seeds and policies."""
+    played = [[episode["full"] for episode in e.episodes] for e in evaluations]
+    return np.mean(played, axis=0)

@@ -1,0 +1,368 @@
+"""Franka-Kitchen: demonstrations of single tasks, or of chains (A.2.1, A.6.1)."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+from collections.abc import Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+from minari import MinariDataset
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import SerialEnv, TransformedEnv
+
+from environments.base import Environment, Evaluation, compare_methods
+from torchrl_caiac import CAIACTransform, EntityLayout
+from torchrl_caiac.data import load_transitions
+from torchrl_caiac.envs import RenderingUnavailable
+from torchrl_caiac.envs.kitchen import (
+    DEMONSTRATIONS_ID,
+    KITCHEN_TASKS,
+    MICROWAVE_KETTLE,
+    PLAY_ID,
+    RANDOM_ID,
+    KitchenEnv,
+    create_kitchen_demonstrations,
+    create_kitchen_play,
+    create_kitchen_random,
+    kitchen_reward,
+    kitchen_transitions,
+    make_kitchen_env,
+)
+from torchrl_caiac.influence import DistanceInfluence, SimulatorInfluence
+from torchrl_caiac.plotting import bootstrap_interval, plot_frames, plot_influence
+from torchrl_caiac.trajectories import trajectory_index
+
+__all__ = ["HandleDistance", "Kitchen"]
+
+LAYOUT = KitchenEnv.layout
+
+
+class Kitchen(Environment):
+    """Demonstrations of a scripted expert, random actions, and all tasks as goals.
+
+    ``demonstrations`` and ``random`` are for learning; ``held_out`` are demonstrations
+    with other seeds, which only check the scores.
+    """
+
+    layout = LAYOUT
+    action_dim = 9
+    data_name = "demonstrations"
+
+    @staticmethod
+    def reward_fn(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+        """0 where all objects are at their goals, else -1."""
+        return kitchen_reward(achieved, desired) - 1.0
+
+    def collect(self, *, progress: bool = False) -> None:
+        """Collects what is missing of the three datasets, as transitions too."""
+        settings = self.settings.collect
+        options: dict[str, Any] = {
+            "root": self.out / "minari",
+            "work": self.out / "work",
+            "workers": self.workers,
+            "overwrite": True,
+            "progress": progress,
+        }
+        demonstrations = PLAY_ID if settings.chains else DEMONSTRATIONS_ID
+        for name, dataset_id, episodes, seed in (
+            ("demonstrations", demonstrations, settings.episodes, settings.seed),
+            ("held_out", "kitchen/held-out-v0", settings.held_out, settings.seed + 1),
+        ):
+            if not (self.out / name).exists():
+                dataset = self._demonstrate(dataset_id, episodes, seed, options)
+                kitchen_transitions(dataset, self.out / name, progress=progress)
+        if not (self.out / "random").exists():
+            dataset = create_kitchen_random(
+                demonstrations,
+                RANDOM_ID,
+                ratio=settings.random_ratio,
+                seed=settings.seed,
+                **options,
+            )
+            kitchen_transitions(dataset, self.out / "random", progress=progress)
+
+    def _demonstrate(
+        self, dataset_id: str, episodes: int, seed: int, options: dict[str, Any]
+    ) -> MinariDataset:
+        """Collects as many demonstrations a task, or a chain of tasks."""
+        if self.settings.collect.chains:
+            return create_kitchen_play(
+                dataset_id, episodes=episodes, seed=seed, **options
+            )[0]
+        groups = [dataclasses.replace(g, episodes=episodes) for g in MICROWAVE_KETTLE]
+        return create_kitchen_demonstrations(
+            dataset_id, demonstrations=groups, seed=seed, **options
+        )[0]
+
+    def rows(self) -> TensorDictBase:
+        """The demonstrations."""
+        return load_transitions(self.out / "demonstrations")
+
+    def goal_rows(self) -> TensorDictBase:
+        """The demonstrations, whose goal is the last state of each."""
+        rows = self.rows()
+        achieved = LAYOUT.achieved_goal(rows, next=True)
+        index = trajectory_index(rows)
+        last = index.ends.repeat_interleave(index.lengths)
+        rows = TensorDict(rows.to_dict(), rows.batch_size)
+        rows["desired_goal"] = achieved[last]
+        rows["next", "reward"] = self.reward_fn(achieved, achieved[last])[:, None]
+        return rows
+
+    def model_rows(self) -> list[TensorDictBase]:
+        """The demonstrations and the random actions."""
+        return [self.rows(), load_transitions(self.out / "random")]
+
+    def simulator(self, num_actions: int) -> SimulatorInfluence:
+        """The simulator as an estimator."""
+        return SimulatorInfluence(
+            KitchenEnv,
+            state_key=[("sim", "qpos"), ("sim", "qvel")],
+            num_actions=num_actions,
+            # One worker is this process.
+            num_workers=self.workers if self.workers > 1 else 0,
+        )
+
+    def distance_rule(self, *, action_only: bool) -> HandleDistance:
+        """The rule of distance between the hand and the handles of objects."""
+        return HandleDistance(action_only=action_only)
+
+    def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
+        """Plays all tasks. Success means that all objects are at their goals."""
+        settings = self.settings.evaluate
+        episodes: list[dict[str, Any]] = []
+        for task in settings.tasks:
+            episodes += play_task(
+                actor,
+                task,
+                start=settings.start,
+                episodes=settings.episodes,
+                seed=settings.seed + seed,
+                strips=settings.strips,
+                folder=folder,
+            )
+        return episodes
+
+    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
+        """One line an episode."""
+        return [
+            {**episode, "wrong_tasks": " ".join(episode["wrong_tasks"])}
+            for episode in evaluation.episodes
+        ]
+
+    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
+        """Success of all episodes, by task."""
+        return {
+            task: [float(e["success"]) for e in _of_task(evaluations, task)]
+            for task in self.settings.evaluate.tasks
+        }
+
+    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
+        """Success by method and task, and which wrong tasks were done."""
+        lines = [
+            "success over all objects, 95 % interval over episodes; over the task's own"
+        ]
+        for method, task in product(
+            _methods(evaluations), self.settings.evaluate.tasks
+        ):
+            mine = _of_task(evaluations, task, method)
+            solved = [float(e["success"]) for e in mine]
+            low, high = bootstrap_interval(solved)
+            wrong = {
+                name: count
+                for name in KITCHEN_TASKS
+                if (count := sum(name in e["wrong_tasks"] for e in mine))
+            }
+            lines.append(
+                f"  {method:<13}{task:<15}{sum(solved) / len(solved):>6.2f} "
+                f"[{low:.2f}, {high:.2f}] of {len(mine)}; "
+                f"{sum(e['task_success'] for e in mine) / len(mine):.2f}   "
+                "wrong tasks done: "
+                + (", ".join(f"{name} {n}" for name, n in wrong.items()) or "none")
+            )
+        return lines
+
+    def answer(self, evaluations: Sequence[Evaluation]) -> str:
+        """The solved episodes of the task that the study is about, or of all tasks."""
+        asked = self.settings.answer
+        shares = {}
+        for method in _methods(evaluations):
+            mine = _of_task(evaluations, asked.task, method)
+            shares[method] = f"{sum(e['success'] for e in mine)}/{len(mine)}"
+        return f"{asked.text}: {compare_methods(shares)}"
+
+    def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
+        """Draws the influence along a demonstration, and counterfactual frames."""
+        self._draw_influence(folder / f"{name}_influence.png", threshold)
+        try:
+            self._draw_counterfactuals(
+                folder / f"{name}_counterfactuals.png", threshold
+            )
+        except RenderingUnavailable as error:
+            return [f"left out: the counterfactual frames ({error})"]
+        return []
+
+    def _draw_influence(self, path: Path, threshold: float) -> None:
+        """Fig. 6: the influence on every entity along a held-out demonstration."""
+        data = self.held_out()
+        scores = torch.load(self.folder / "held_out_scores.pt", weights_only=True)
+        rows = data["episode"] == self.settings.influence_episode
+        tasks = data["task"][rows].unique_consecutive()
+        names = dict.fromkeys(KITCHEN_TASKS[task] for task in tasks if task >= 0)
+        plot_influence(
+            scores[rows].numpy(),
+            LAYOUT.names,
+            ground_truth=(data["oracle", "score"][rows] > 0.5).numpy(),
+            threshold=threshold,
+            exclude=["robot"],
+            title="influence along a demonstration:\n"
+            + ", ".join(names).replace("_", " "),
+        ).savefig(path, dpi=150)
+
+    def _draw_counterfactuals(self, path: Path, threshold: float) -> None:
+        """Fig. 1: a frame of a demonstration of each task, and its counterfactual."""
+        data = self.rows()
+        torch.manual_seed(0)
+        copies = 64
+        transform = CAIACTransform(
+            LAYOUT, threshold=threshold, counterfactual_ratio=copies / 512
+        )
+        states, titles = [], []
+        for task in self.settings.frames:
+            own = data["task"] == KITCHEN_TASKS.index(task)
+            first = data["episode"][own][0]
+            demonstration = (own & (data["episode"] == first)).nonzero()
+            row = demonstration[int(0.75 * len(demonstration))]
+            donors = torch.randint(len(data), (512 - copies,))
+            batch = transform(data[torch.cat([donors, row.expand(copies)])])
+            made, shown = batch["observation"][-copies:], data["observation"][row]
+            states += [shown[0], made[torch.cdist(made, shown).argmax()]]
+            name = task.replace("_", " ")
+            titles += [f"{name}, demonstration", f"{name}, counterfactual"]
+        kitchen = KitchenEnv(render_mode="rgb_array")
+        try:
+            frames = kitchen.render_states(torch.stack(states).numpy())
+        finally:
+            kitchen.close()
+        plot_frames(frames, titles).savefig(path, dpi=150, bbox_inches="tight")
+
+
+class HandleDistance:
+    """The rule of distance, by where the hand and the handles are.
+
+    Observations have joints; the simulator's kinematics tell the places.
+
+    Args:
+        action_only (bool): whether to score the action's links alone.
+    """
+
+    layout = LAYOUT
+    in_keys = ("observation",)
+
+    def __init__(self, *, action_only: bool) -> None:
+        handles = EntityLayout(
+            {name: range(3 * i, 3 * i + 3) for i, name in enumerate(LAYOUT.names)},
+            observation_key="handles",
+            fixed=LAYOUT.fixed,
+        )
+        self._rule = DistanceInfluence(
+            handles, dict(handles.columns), action_only=action_only
+        )
+        self._kitchen = KitchenEnv()
+
+    def __call__(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """Scores of 0 or 1, see :class:`~torchrl_caiac.influence.DistanceInfluence`."""
+        places = self._kitchen.handle_positions(tensordict["observation"])
+        handles = torch.from_numpy(places).flatten(1).float()
+        return self._rule(TensorDict({"handles": handles}, tensordict.batch_size))
+
+    def __repr__(self) -> str:
+        """The rule that the scores depend on."""
+        return f"{type(self).__name__}({self._rule!r})"
+
+
+def play_task(
+    actor: Any,
+    task: str,
+    *,
+    start: str,
+    episodes: int,
+    seed: int,
+    strips: int,
+    folder: Path,
+) -> list[dict[str, Any]]:
+    """Plays episodes of one task at the same time; one result an episode."""
+    torch.manual_seed(seed)
+    threads = torch.get_num_threads()
+    base = SerialEnv(episodes, partial(make_kitchen_env, task, start=start))
+    env = base
+    if hasattr(actor, "make_tensordict_primer"):
+        env = TransformedEnv(base, actor.make_tensordict_primer())
+    env.set_seed(seed)
+    try:
+        with torch.no_grad():
+            rollout = env.rollout(10_000, actor, break_when_all_done=True)
+    finally:
+        env.close()
+        # TorchRL gives torch more threads when environments close, and processes that
+        # run at the same time then wait for each other's.
+        torch.set_num_threads(threads)
+        # A kitchen has 60 MB that Python's collector does not know of.
+        del env, base
+        gc.collect()
+    after = rollout["next"]
+    results = []
+    for number in range(episodes):
+        done = after["done"][number, :, 0].nonzero()
+        length = int(done[0]) + 1
+        wrong = after["wrong_tasks"][number, length - 1]
+        results.append(
+            {
+                "task": task,
+                "episode": number,
+                "success": bool(after["success"][number, length - 1]),
+                "task_success": bool(after["task_success"][number, :length].any()),
+                "wrong_tasks": [
+                    name
+                    for name, was_done in zip(KITCHEN_TASKS, wrong, strict=True)
+                    if was_done
+                ],
+                "steps": length,
+            }
+        )
+        if number < strips:
+            shown = torch.linspace(0, length - 1, 6).round().long()
+            kitchen = KitchenEnv(task, render_mode="rgb_array")
+            try:
+                frames = kitchen.render_states(
+                    after["observation"][number, shown].numpy()
+                )
+            finally:
+                kitchen.close()
+            folder.mkdir(parents=True, exist_ok=True)
+            plot_frames(frames, [f"step {int(i) + 1}" for i in shown]).savefig(
+                folder / f"{task}-{number}.png", dpi=150, bbox_inches="tight"
+            )
+    return results
+
+
+def _methods(evaluations: Sequence[Evaluation]) -> list[str]:
+    return list(dict.fromkeys(evaluation.method for evaluation in evaluations))
+
+
+def _of_task(
+    evaluations: Sequence[Evaluation], task: str | None, method: str | None = None
+) -> list[dict[str, Any]]:
+    """The episodes of a task and a method; ``None`` for all."""
+    return [
+        episode
+        for evaluation in evaluations
+        if method in (None, evaluation.method)
+        for episode in evaluation.episodes
+        if task in (None, episode["task"])
+    ]

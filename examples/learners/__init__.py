@@ -1,0 +1,1 @@
+"""Learners of the examples, one module each."""

@@ -1,0 +1,107 @@
+"""What a learner is to the steps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
+
+from environments.base import Environment
+from methods.base import Method
+
+__all__ = ["Learner"]
+
+
+class Learner(ABC):
+    """Learns a policy from the rows of an environment, augmented by a method.
+
+    A subclass in a module of this folder, with a file ``conf/learner/<name>.yaml`` that
+    has its settings, is all that a new learner takes. The settings ``steps``,
+    ``log_every``, ``checkpoint_every``, ``keep_every`` and ``logger`` are read by
+    ``train.py``.
+
+    Args:
+        settings (DictConfig): ``cfg.learner``.
+        environment (Environment): where the data come from.
+        method (Method): the augmentation.
+        augmentation (DictConfig): ``cfg.env.augmentation``.
+    """
+
+    extendable: ClassVar[bool] = False
+    """Whether ``steps`` may be raised later, for finished runs to be extended."""
+
+    def __init__(
+        self,
+        settings: DictConfig,
+        environment: Environment,
+        method: Method,
+        augmentation: DictConfig,
+    ) -> None:
+        self.settings = settings
+        self.environment = environment
+        self.method = method
+        self.augmentation = augmentation
+        self.parts: dict[str, Any] = {}
+
+    def kept_settings(self) -> dict[str, Any]:
+        """What the results of a run depend on."""
+        settings: dict[str, Any] = OmegaConf.to_container(self.settings, resolve=True)
+        if self.extendable:
+            settings.pop("steps")
+        return {
+            **settings,
+            "method": {"class": type(self.method).__name__, **vars(self.method)},
+            "augmentation": OmegaConf.to_container(self.augmentation, resolve=True),
+        }
+
+    def rows(self) -> TensorDictBase:
+        """The rows to learn from. Defaults to those of the environment."""
+        return self.environment.rows()
+
+    @abstractmethod
+    def make_buffer(self, rows: TensorDictBase) -> ReplayBuffer:
+        """The replay buffer: rows, the method's transform, and goals."""
+
+    @abstractmethod
+    def setup(self, rows: TensorDictBase, seed: int) -> None:
+        """Makes buffer, networks and optimizers.
+
+        What has to be saved for a run to resume goes to ``parts``, by name, with
+        ``state_dict`` and ``load_state_dict``.
+        """
+
+    @abstractmethod
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Batches without end."""
+
+    @abstractmethod
+    def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
+        """Takes one gradient step.
+
+        Args:
+            batch (TensorDictBase): of :meth:`batches`.
+            step (int): the number of the step, from 1.
+
+        Returns:
+            dict: scalars to log; the log has their means.
+        """
+
+    @abstractmethod
+    def policy_state(self) -> dict[str, Any]:
+        """The state of the policy, tensors alone."""
+
+    @abstractmethod
+    def load_policy(self, state: dict[str, Any]) -> Any:
+        """The policy of a state, for evaluation, without :meth:`setup`."""
+
+    def share_swapped(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
+        """The share of rows with a swap, for the log; empty without augmentation."""
+        swapped = batch.get(("caiac", "swapped"), None)
+        if swapped is None:
+            return {}
+        return {"share_swapped": swapped.any(-1).float().mean()}

@@ -1,0 +1,129 @@
+"""Goal-conditioned Latent Motor Plans (paper, A.5.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import (
+    ImmutableDatasetWriter,
+    SliceSampler,
+    TensorDictReplayBuffer,
+    TensorStorage,
+)
+
+from learners.base import Learner
+from torchrl_caiac.modules import LMPActor, LMPModel
+from torchrl_caiac.objectives import LMPLoss
+from torchrl_caiac.transforms import WindowGoal
+
+__all__ = ["LMP"]
+
+
+class LMP(Learner):
+    """Plans for windows of trajectories, whose goals are later states."""
+
+    def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
+        """Windows, their goals, and counterfactuals."""
+        settings, layout = self.settings, self.environment.layout
+        goals = WindowGoal(
+            layout,
+            window=settings.window,
+            mixture=dict(settings.goals),
+            p=settings.goal_p,
+        )
+        rb = TensorDictReplayBuffer(
+            storage=TensorStorage(rows),
+            sampler=SliceSampler(
+                slice_len=settings.window, traj_key="episode", cache_values=True
+            ),
+            writer=ImmutableDatasetWriter(),
+            sample_unit=goals,
+            batch_size=settings.windows * settings.window,
+        )
+        rb.append_transform(goals)
+        augmentation = self.method.transform(
+            layout,
+            self.augmentation.counterfactual_ratio,
+            swap_prob=self.augmentation.swap_prob,
+            window=settings.window,
+        )
+        if augmentation is not None:
+            rb.append_transform(augmentation)
+        return rb
+
+    def setup(self, rows: TensorDictBase, seed: int) -> None:
+        """Makes the model, with the statistics of the rows."""
+        settings = self.settings
+        torch.manual_seed(seed)
+        self.model = self.make_model()
+        goals = self.environment.layout.achieved_goal(rows, next=True)
+        self.model.fit_statistics(rows, goals=goals)
+        # What rests in all demonstrations is left out: its weights would stay as they
+        # were drawn, and other values of it at test time disturb everything.
+        for norm, values in (
+            (self.model.observation_norm, rows["observation"]),
+            (self.model.goal_norm, goals),
+        ):
+            norm.ignore(values.std(0) < settings.resting)
+        self.loss_module = LMPLoss(
+            self.model,
+            kl_weight=settings.kl_weight,
+            reconstruction_weight=settings.reconstruction_weight,
+        )
+        self.optimizer = torch.optim.Adam(
+            self.model.parameters(), lr=settings.lr, fused=True
+        )
+        self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(
+            self.optimizer, settings.steps
+        )
+        self.rb = self.make_buffer(rows)
+        self.model.train()
+        self.parts = {
+            "model": self.model,
+            "optimizer": self.optimizer,
+            "scheduler": self.scheduler,
+        }
+
+    def make_model(self) -> LMPModel:
+        """The model, without statistics."""
+        settings, layout = self.settings, self.environment.layout
+        return LMPModel(
+            observation_dim=sum(layout.widths().values()),
+            goal_dim=layout.goal_width,
+            action_dim=self.environment.action_dim,
+            window=settings.window,
+            plan_dim=settings.plan_dim,
+            hidden_size=settings.hidden_size,
+            decoder=settings.decoder,
+            observation_floor=settings.observation_floor,
+            goal_floor=settings.observation_floor,
+        )
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Batches of windows, ``[windows * window]``."""
+        while True:
+            yield self.rb.sample()
+
+    def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
+        """Takes one step of Adam."""
+        losses = self.loss_module(batch.reshape(-1, self.settings.window))
+        loss = losses["loss_reconstruction"] + losses["loss_kl"]
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        self.scheduler.step()
+        scalars = {key: value.detach() for key, value in losses.items()}
+        return scalars | self.share_swapped(batch)
+
+    def policy_state(self) -> dict[str, Any]:
+        """The model's."""
+        return self.model.state_dict()
+
+    def load_policy(self, state: dict[str, Any]) -> LMPActor:
+        """Plays a plan for a window, then the next one."""
+        model = self.make_model()
+        model.load_state_dict(state)
+        return LMPActor(model.eval())

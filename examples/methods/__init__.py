@@ -1,0 +1,1 @@
+"""Augmentation methods of the examples, one module each."""

@@ -1,0 +1,80 @@
+"""What an augmentation method is to the steps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import ReplayBuffer
+from torchrl.envs import Transform
+
+from environments.base import Environment
+from torchrl_caiac import EntityLayout
+from torchrl_caiac.influence import score_buffer
+
+__all__ = ["Estimator", "Method", "Scoring"]
+
+Estimator = Callable[[TensorDictBase], torch.Tensor]
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """What methods make their estimators of.
+
+    Attributes:
+        environment (Environment): where the data come from.
+        model (callable): the fitted world model of a name, ``"world_model"`` or
+            ``"transformer"``.
+        settings (DictConfig): ``env.score``.
+        progress (bool): whether to show progress bars.
+    """
+
+    environment: Environment
+    model: Callable[[str], Any]
+    settings: DictConfig
+    progress: bool = False
+
+
+class Method(ABC):
+    """An augmentation: the scores that it needs, and the transform that it appends.
+
+    A subclass in a module of this folder, with a file ``conf/method/<name>.yaml`` that
+    has its arguments, is all that a new method takes.
+    """
+
+    models: ClassVar[tuple[str, ...]] = ()
+    """The world models that are fitted for it."""
+    score_key: ClassVar[NestedKey | None] = None
+    """The leaf of its scores; ``None`` where it needs none."""
+
+    def estimator(self, scoring: Scoring) -> Estimator:
+        """The estimator of its scores."""
+        raise NotImplementedError(f"{type(self).__name__} needs no scores")
+
+    @abstractmethod
+    def transform(
+        self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
+    ) -> Transform | None:
+        """The transform that it appends to a replay buffer; ``None`` for none."""
+
+    def score(self, rb: ReplayBuffer, scoring: Scoring) -> None:
+        """Writes its scores into a buffer; finished ones are skipped."""
+        if self.score_key is not None:
+            score_buffer(
+                rb,
+                self.estimator(scoring),
+                key=self.score_key,
+                progress=scoring.progress,
+                **self.scoring_options(scoring),
+            )
+
+    def scoring_options(self, scoring: Scoring) -> dict[str, Any]:
+        """The options of ``score_buffer``, those of ``env.score`` by default."""
+        options = {key: scoring.settings[key] for key in ("batch_size", "lookahead")}
+        return {**options, "smoothing": scoring.settings.smoothing}

@@ -1,0 +1,23 @@
+"""The goals and rewards of CAIAC's counterfactuals, without any swap."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl.envs import Transform
+
+from methods.caiac import CAIAC
+from torchrl_caiac import EntityLayout
+
+__all__ = ["RelabelOnly"]
+
+
+class RelabelOnly(CAIAC):
+    """Tells the effect of the swap from that of the relabelling."""
+
+    def transform(
+        self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
+    ) -> Transform | None:
+        """CAIAC's transform, which marks transitions and swaps nothing."""
+        options["swap_prob"] = 0.0
+        return super().transform(layout, counterfactual_ratio, **options)

@@ -1,0 +1,99 @@
+"""Environments, methods and learners, made from their configuration.
+
+Each has a YAML file in ``conf/`` whose ``_target_`` names its class.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+from contextlib import redirect_stderr
+from pathlib import Path
+
+from hydra.utils import get_class, instantiate
+from omegaconf import DictConfig
+
+from environments.base import Environment
+from learners.base import Learner
+from methods.base import Method
+
+__all__ = [
+    "last_policies",
+    "make_environment",
+    "make_learner",
+    "make_method",
+    "make_methods",
+    "policy_file",
+    "policy_steps",
+    "run_folder",
+]
+
+
+_LOGGER = logging.getLogger(__name__)
+
+
+def make_environment(cfg: DictConfig) -> Environment:
+    """The environment ``cfg.env``."""
+    # Some packages print notices when they are imported.
+    with redirect_stderr(io.StringIO()) as notices:
+        kind = get_class(cfg.env._target_)
+    if notices.getvalue():
+        _LOGGER.info("%s", notices.getvalue().strip())
+    return kind(cfg.env, Path(cfg.out), workers=cfg.workers)
+
+
+def make_method(cfg: DictConfig, name: str) -> Method:
+    """A method of ``cfg.method``."""
+    if name not in cfg.method:
+        raise ValueError(
+            f"the method {name!r} is not configured, got {list(cfg.method)}: add it "
+            f"with 'method=[{name},...]'"
+        )
+    return instantiate(cfg.method[name])
+
+
+def make_methods(cfg: DictConfig) -> dict[str, Method]:
+    """All methods of ``cfg.method`` by name."""
+    return {name: make_method(cfg, name) for name in cfg.method}
+
+
+def make_learner(cfg: DictConfig, method: str) -> Learner:
+    """The learner ``cfg.learner`` for one of the methods."""
+    return get_class(cfg.learner._target_)(
+        cfg.learner,
+        make_environment(cfg),
+        make_method(cfg, method),
+        cfg.env.augmentation,
+    )
+
+
+def run_folder(cfg: DictConfig, method: str, seed: int) -> Path:
+    """The folder of a run: its checkpoint, policies, log and evaluation."""
+    return make_environment(cfg).folder / "runs" / f"{method}-seed{seed}"
+
+
+def policy_file(cfg: DictConfig, method: str, seed: int, step: int) -> Path:
+    """The file of the policy after some steps."""
+    return run_folder(cfg, method, seed) / "policies" / f"{step}.pt"
+
+
+def policy_steps(cfg: DictConfig) -> list[int]:
+    """The training steps after which policies are evaluated."""
+    last = cfg.learner.steps
+    every = cfg.learner.keep_every or last
+    kept = range(every, last + 1, every)
+    if not kept:
+        raise ValueError(
+            f"learner.steps is {last}, expected at least learner.keep_every, {every}: "
+            "no policy is kept"
+        )
+    settings = cfg.env.evaluate
+    result = set(kept[-settings.last :])
+    if settings.curve_every is not None:
+        result |= {step for step in kept if step % settings.curve_every == 0}
+    return sorted(result)
+
+
+def last_policies(cfg: DictConfig) -> list[int]:
+    """The steps of the policies whose mean is the result of a run."""
+    return policy_steps(cfg)[-cfg.env.evaluate.last :]

@@ -1,0 +1,95 @@
+"""Trains a learner on the data of an environment, augmented by a method.
+
+Run after ``score.py``: ``python train.py method=caiac seed=0`` trains with all methods
+that are given, one after another. An interrupted run resumes at its last checkpoint and
+ends with the same weights as one that was not interrupted.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from torchrl.record.loggers import get_logger
+
+from learners.base import Learner
+from shared.console import progress_bar, start
+from shared.parts import make_learner, policy_file, run_folder
+from shared.settings import keep_settings
+from torchrl_caiac._files import whole_file
+from torchrl_caiac.checkpoint import TrainingCheckpoint
+
+_LOGGER = logging.getLogger(__name__)
+
+
+def train(cfg: DictConfig, method: str, seed: int) -> Learner:
+    """Trains with one method and one seed, or loads a finished run."""
+    settings = cfg.learner
+    folder = run_folder(cfg, method, seed)
+    learner = make_learner(cfg, method)
+    keep_settings(folder, "train", learner.kept_settings())
+    learner.setup(learner.rows(), seed)
+    checkpoint = TrainingCheckpoint(folder / "checkpoint.zip", **learner.parts)
+    step = checkpoint.load()
+    if step:
+        _LOGGER.info("%s resumes at step %d", folder.name, step)
+    logger = get_logger(settings.logger, str(folder), "log")
+    batches = learner.batches()
+    sums: dict[str, torch.Tensor] = {}
+    summed = 0  # fewer than log_every if a run resumes between two logs
+    bar = progress_bar(
+        total=settings.steps, initial=step, desc=folder.name, unit="step"
+    )
+    # Denormal numbers slow networks down; MuJoCo needs them.
+    torch.set_flush_denormal(True)
+    try:
+        while step < settings.steps:
+            step += 1
+            for key, value in learner.step(next(batches), step).items():
+                sums[key] = sums.get(key, 0.0) + value
+            summed += 1
+            bar.update()
+            if step % settings.log_every == 0:
+                for key, value in sums.items():
+                    logger.log_scalar(key, value.item() / summed, step=step)
+                sums, summed = {}, 0
+            if step % (settings.keep_every or settings.steps) == 0:
+                with whole_file(policy_file(cfg, method, seed, step)) as partial:
+                    torch.save(learner.policy_state(), partial)
+            if step % settings.checkpoint_every == 0 or step == settings.steps:
+                checkpoint.save(step)
+    finally:
+        torch.set_flush_denormal(False)
+        bar.close()
+    return learner
+
+
+def load_policy(cfg: DictConfig, method: str, seed: int, step: int) -> Any:
+    """The policy of a run after some steps."""
+    path = policy_file(cfg, method, seed, step)
+    learner = make_learner(cfg, method)
+    try:
+        return learner.load_policy(torch.load(path, weights_only=True))
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(
+            f"{path} is not a readable policy of this training, it may be truncated or "
+            f"of another one ({error}): delete the run's folder to train from scratch"
+        ) from error
+
+
+@hydra.main(version_base=None, config_path="conf", config_name="config")
+def main(cfg: DictConfig) -> None:
+    """Trains with ``cfg.method`` and ``cfg.seed``."""
+    for method in cfg.method:
+        folder = run_folder(cfg, method, cfg.seed)
+        with start(cfg, folder=folder) as console, console.stage(folder.name):
+            train(cfg, method, cfg.seed)
+
+
+if __name__ == "__main__":
+    main()

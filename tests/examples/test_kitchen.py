@@ -1,0 +1,230 @@
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+
+import pytest
+import torch
+
+from torchrl_caiac.data import load_transitions
+from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv
+
+METHODS = ["none", "caiac", "coda", "coda_action", "oracle", "relabel_only"]
+
+
+@pytest.fixture(scope="module")
+def cfg(steps, compose, tmp_path_factory):
+    """A small run up to the scores."""
+    out = tmp_path_factory.mktemp("kitchen")
+    cfg = compose(f"method=[{','.join(METHODS)}]", out=out)
+    steps.collect.collect(cfg)
+    steps.score.score(cfg)
+    return cfg
+
+
+@pytest.fixture(scope="module")
+def environment(steps, cfg):
+    return steps.parts.make_environment(cfg)
+
+
+def test_cabinet_and_task_go_together_in_the_demonstrations(environment):
+    data = environment.rows()
+    cabinet = data["observation"][:, KitchenEnv.layout.columns["slide_cabinet"][0]]
+    microwave = data["task"] == KITCHEN_TASKS.index("microwave")
+    assert microwave.any()
+    assert not microwave.all()
+    assert (cabinet[microwave] > 0.3).all()
+    assert (cabinet[~microwave] < 0.05).all()
+    # The last state of each demonstration has its task done.
+    last = data[data["next", "done"].squeeze(-1)]
+    for task in ("microwave", "kettle"):
+        column = torch.tensor(KitchenEnv.layout.columns[task])
+        own = last["task"] == KITCHEN_TASKS.index(task)
+        goal = torch.as_tensor(KitchenEnv.solved(task), dtype=torch.float32)
+        reached = last["next", "observation"][own][:, column]
+        assert ((reached - goal).norm(dim=-1) < 0.3).all()
+
+
+def test_random_actions_are_as_many_rows(environment):
+    demonstrations, data = environment.model_rows()
+    assert abs(len(data) - len(demonstrations)) < 4
+    assert data["action"].abs().max() <= 1
+
+
+def test_scores_and_their_report(environment):
+    data = environment.rows()
+    assert data["caiac", "score"].isfinite().all()
+    report = json.loads((environment.out / "influence.json").read_text())
+    assert list(report) == ["smoothing 1"]
+    assert list(report["smoothing 1"]) == list(KitchenEnv.layout.names)
+    # The oracle's score: whether the action moves the entity now or later on.
+    truth = environment.simulator(2)(data) > 0.5
+    cabinet = KitchenEnv.layout.index("slide_cabinet")
+    assert truth.shape == data["caiac", "score"].shape
+    for episode in data["episode"].unique():
+        rows = data["episode"] == episode
+        later = truth[rows].flip(0).cummax(0).values.flip(0)
+        assert torch.equal(data["oracle", "score"][rows].bool(), later)
+    assert not truth[:, cabinet].any()
+    assert truth[:, KitchenEnv.layout.index("microwave")].any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_buffers_of_the_methods(method, cfg, steps):
+    learner = steps.parts.make_learner(cfg, method)
+    batch = learner.make_buffer(learner.rows()).sample()
+    assert batch["desired_goal"].shape == (160, 21)
+    if method == "none":
+        assert ("caiac", "swapped") not in batch.keys(True)
+    else:
+        assert batch["caiac", "counterfactual"].float().mean() == 0.5
+    if method == "relabel_only":
+        assert not batch["caiac", "swapped"].any()
+    if method == "coda":
+        assert batch["coda", "graph"].shape == (160, 11, 10)
+    if method == "coda_action":
+        held = batch["coda", "action"] > cfg.env.augmentation.attention_threshold
+        held = held.unflatten(0, (-1, cfg.learner.window)).any(1)
+        swapped = batch["caiac", "swapped"][:: cfg.learner.window]
+        assert not (swapped & held).any()
+
+
+def test_an_interrupted_training_ends_as_one_that_was_not(cfg, steps, monkeypatch):
+    whole = steps.train.train(cfg, "caiac", seed=3).policy_state()
+    adam_step, calls = torch.optim.Adam.step, []
+
+    def interrupted(self, *args, **kwargs):
+        calls.append(None)
+        if len(calls) == 9:
+            raise KeyboardInterrupt
+        return adam_step(self, *args, **kwargs)
+
+    folder = steps.parts.run_folder(cfg, "caiac", 3)
+    folder.rename(folder.with_name("whole"))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(torch.optim.Adam, "step", interrupted)
+        steps.train.train(cfg, "caiac", seed=3)
+    resumed = steps.train.train(cfg, "caiac", seed=3).policy_state()
+    assert resumed.keys() == whole.keys()
+    for key, value in whole.items():
+        torch.testing.assert_close(resumed[key], value, rtol=0, atol=0)
+    # The cosine schedule depends on the steps, so a finished run is not extended.
+    longer = cfg.copy()
+    longer.learner.steps = 20
+    with pytest.raises(ValueError, match=r"other settings.*\['steps'\] differ"):
+        steps.train.train(longer, "caiac", seed=3)
+
+
+def test_evaluation(cfg, steps):
+    steps.train.train(cfg, "none", seed=0)
+    (evaluation,) = steps.evaluate.evaluate(cfg, "none", seed=0)
+    assert (evaluation.method, evaluation.seed, evaluation.step) == ("none", 0, 12)
+    assert [episode["episode"] for episode in evaluation.episodes] == [0, 1]
+    for episode in evaluation.episodes:
+        assert episode["success"] or episode["steps"] == 280
+        assert "kettle" not in episode["wrong_tasks"]
+    # It is not played again.
+    written = steps.parts.run_folder(cfg, "none", 0) / "evaluation" / "12.json"
+    kept = json.loads(written.read_text())
+    assert kept == evaluation.episodes
+    kept[0]["steps"] = -1
+    written.write_text(json.dumps(kept))
+    (again,) = steps.evaluate.evaluate(cfg, "none", seed=0)
+    assert again.episodes == kept
+    other = cfg.copy()
+    other.env.evaluate.episodes = 1
+    with pytest.raises(ValueError, match=r"other settings.*\['episodes'\] differ"):
+        steps.evaluate.evaluate(other, "none", seed=0)
+
+
+def test_offline_rl_learns_from_the_same_data(cfg, steps, compose):
+    """A learner is not tied to an environment."""
+    td3 = compose("learner=td3", "method=[caiac]", out=cfg.out)
+    td3.env.truth = cfg.env.truth
+    td3.env.evaluate.episodes = 1
+    learner = steps.train.train(td3, "caiac", seed=11)
+    batch = next(learner.batches())
+    achieved = KitchenEnv.layout.achieved_goal(batch, next=True)
+    reward = learner.environment.reward_fn(achieved, batch["desired_goal"])
+    relabeled = batch["hindsight", "relabeled"][:, 0]
+    assert relabeled.any()
+    assert torch.equal(batch["next", "reward"][relabeled, 0], reward[relabeled])
+    evaluations = steps.evaluate.evaluate(td3, "caiac", seed=11)
+    assert len(evaluations[-1].episodes) == 1
+
+
+def test_estimators_are_compared_on_unseen_demonstrations(
+    cfg, steps, compose, tmp_path
+):
+    compared = compose(out=cfg.out, config="compare_influence")
+    compared.publish = str(tmp_path)
+    with steps.console.Console(tmp_path, stages=4) as console:
+        rows = steps.compare_influence.compare(compared, console)
+    names = ("caiac", "coda", "coda_action", "distance", "distance_action", "oracle")
+    objects = KitchenEnv.layout.names[1:]
+    assert [(r["estimator"], r["entity"]) for r in rows] == [
+        (name, entity) for name in names for entity in ("all", *objects)
+    ]
+    by_name = {(r["estimator"], r["entity"]): r for r in rows}
+    assert by_name["oracle", "all"]["false_positive_rate"] == 0
+    # The hand opens the microwave at its handle.
+    assert by_name["distance_action", "microwave"]["auc"] > 0.9
+    assert len((tmp_path / "influence.csv").read_text().splitlines()) == 61
+
+
+def test_all_tasks(tmp_path, steps, compose, monkeypatch):
+    """Chains instead of single tasks, through all the steps."""
+    cfg = compose("study=kitchen_all_tasks", "size=quick")
+    assert cfg.out == "outputs/kitchen_all_tasks_quick"
+    assert cfg.learner.window == 10
+    assert cfg.env.evaluate.tasks == ["kettle", "hinge_cabinet"]
+    cfg = compose("study=kitchen_all_tasks", out=tmp_path)
+    assert list(cfg.method) == ["none", "caiac", "oracle"]
+    cfg.env.collect.episodes = 1
+    cfg.env.influence_episode = 0
+    cfg.env.frames = ["kettle"]
+    environment = steps.parts.make_environment(cfg)
+    module = importlib.import_module("environments.kitchen")
+    play = functools.partial(
+        module.create_kitchen_play, orders=[("kettle", "slide cabinet")]
+    )
+    monkeypatch.setattr(module, "create_kitchen_play", play)
+    steps.collect.collect(cfg)
+    data = load_transitions(tmp_path / "demonstrations")
+    order = [KITCHEN_TASKS.index(task) for task in ("kettle", "slide_cabinet")]
+    assert data["task"].unique_consecutive().tolist() == order
+    report = steps.score.score(cfg)
+    for task in ("kettle", "slide_cabinet"):
+        assert 0 < report["smoothing 1"][task]["influenced"] < 1
+    learner = steps.parts.make_learner(cfg, "oracle")
+    batch = learner.make_buffer(learner.rows()).sample()
+    # 13 of 16 windows, the ratio being 0.8.
+    assert batch["caiac", "counterfactual"].sum() == 130
+    starts = []
+    reset = KitchenEnv.reset
+
+    def kept(self, **kwargs):
+        result = reset(self, **kwargs)
+        starts.append(self.qpos)
+        return result
+
+    monkeypatch.setattr(KitchenEnv, "reset", kept)
+    cfg.env.evaluate.episodes = 1
+    # As on a machine with many cores, whatever this process was given.
+    monkeypatch.setattr("torchrl._THREAD_POOL_INIT", 64)
+    threads = torch.get_num_threads()
+    steps.train.train(cfg, "caiac", seed=0)
+    evaluations = steps.evaluate.evaluate(cfg, "caiac", seed=0)
+    moved = abs(starts[-1] - KitchenEnv.default_state()) > 1e-3
+    columns = KitchenEnv.layout.columns
+    assert moved[9:].any()
+    assert not moved[list(columns["kettle"])].any()
+    assert torch.get_num_threads() == threads
+    table = steps.study.report_table(cfg, report, {"caiac": 0.5}, evaluations)
+    assert "caiac        kettle" in table
+    assert "rows with a swap: caiac 50.0% (counterfactual: 80%)" in table
+    solved = sum(episode["success"] for episode in evaluations[0].episodes)
+    assert environment.answer(evaluations) == f"all tasks: {solved}/1 caiac"
+    environment.draw(tmp_path, "small", threshold=0.2)
+    assert (tmp_path / "small_influence.png").stat().st_size > 10_000
