@@ -64,7 +64,9 @@ def test_a_missing_file(name, tmp_path):
         load_transitions(tmp_path / "data")
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}', '{"shape": "x"}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[1]", '{"a": 1}', '{"_type": 1, "shape": "x"}']
+)
 def test_a_foreign_meta_file(text, tmp_path):
     rows().memmap(tmp_path / "data")
     (tmp_path / "data/meta.json").write_text(text)
@@ -89,11 +91,67 @@ def test_missing_folders_and_keys(tmp_path):
     assert len(load_transitions(tmp_path / "data", keys=["action"])) == 6
 
 
-def test_an_unknown_dtype_is_not_guessed(tmp_path):
-    rows().memmap(tmp_path / "data")
-    meta = tmp_path / "data/meta.json"
+def change_meta(folder, change):
+    meta = folder / "meta.json"
     content = json.loads(meta.read_text())
-    content["action"]["shape"] = [6, 3]
+    change(content)
     meta.write_text(json.dumps(content))
+
+
+def test_a_file_must_fit_its_description(tmp_path):
+    rows().memmap(tmp_path / "data")
+    change_meta(tmp_path / "data", lambda meta: meta["action"].update(shape=[6, 3]))
     with pytest.raises(ValueError, match="expected 72"):
+        load_transitions(tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"shape": "[6, 2]"},
+        {"shape": [6, -2]},
+        {"shape": [6, True]},
+        {"shape": [3, 4]},
+        {"dtype": "torch.float23"},
+        {"dtype": "torch.nn"},
+        {"dtype": None},
+        {"is_nested": True},
+    ],
+)
+def test_a_damaged_description_is_refused(entry, tmp_path):
+    """Nothing is allocated by a shape of text, no leaf is dropped without a word."""
+    rows().memmap(tmp_path / "data")
+    change_meta(tmp_path / "data", lambda meta: meta["action"].update(entry))
+    with pytest.raises(ValueError, match=r"meta.json has an unreadable .*'action'"):
+        load_transitions(tmp_path / "data")
+
+
+class Payload:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return open, (self.path, "w")
+
+
+@pytest.mark.parametrize("below", [(), ("next",)])
+def test_nothing_is_unpickled(below, tmp_path):
+    data, ran = rows(), tmp_path / "ran"
+    data.set_non_tensor((*below, "note"), Payload(ran))
+    data.memmap(tmp_path / "data")
+    with pytest.raises(ValueError, match=r"NonTensorData in 'note', expected tensors"):
+        load_transitions(tmp_path / "data")
+    assert not ran.exists()
+    # The payload works: tensordict runs it if it is allowed to.
+    TensorDict.load_memmap(tmp_path / "data", allow_pickle=True)
+    assert ran.exists()
+
+
+def test_another_class_is_refused(tmp_path):
+    rows().memmap(tmp_path / "data")
+    kind = "<class 'tensordict.tensorclass.NonTensorData'>"
+    change_meta(tmp_path / "data/next", lambda meta: meta.update(_type=kind))
+    with pytest.raises(ValueError, match=r"next.meta.json describes a .*NonTensorData"):
         load_transitions(tmp_path / "data")

@@ -19,6 +19,8 @@ __all__ = ["load_transitions"]
 
 _KEYS: tuple[NestedKey, ...] = ("action", "episode", ("next", "done"))
 
+_AGAIN = "delete the folder and create the data again"
+
 
 def load_transitions(
     path: str | Path, *, keys: Iterable[NestedKey] = _KEYS
@@ -44,7 +46,8 @@ def load_transitions(
 
     Raises:
         FileNotFoundError: the folder does not exist.
-        ValueError: the folder is not a memory-mapped tensordict, is truncated, has no
+        ValueError: the folder is not a memory-mapped tensordict, is truncated, has
+            something other than tensors (it could be a pickle, and is not read), has no
             rows or several batch dimensions, or lacks a key.
 
     Examples:
@@ -70,7 +73,7 @@ def load_transitions(
             f"{path} has batch size {shape}, expected [T] with at least one row: store "
             "flat transitions"
         )
-    data = TensorDict.load_memmap(path)
+    data = TensorDict.load_memmap(path, allow_pickle=False)
     missing = [key for key in keys if data.get(key, None) is None]
     if missing:
         raise ValueError(
@@ -82,44 +85,69 @@ def load_transitions(
 
 
 def _check_folder(folder: Path, root: Path) -> list[int]:
-    """Checks that the file of every leaf is complete, and returns the batch size."""
+    """Checks that a folder has tensors alone, each complete; returns its batch size."""
     meta = folder / "meta.json"
-    again = "delete the folder and create the data again"
     if not meta.exists():
         raise ValueError(
             f"{root} is not a memory-mapped tensordict, {meta} is missing: give "
-            f"another folder, or {again}"
+            f"another folder, or {_AGAIN}"
         )
     try:
         content = json.loads(meta.read_text(encoding="utf-8"))
-        shape = [int(size) for size in content["shape"]]
+        kind, shape = content["_type"], _shape(content["shape"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
-            f"{meta} is truncated or not from tensordict ({error}): {again}"
+            f"{meta} is truncated or not from tensordict ({error}): {_AGAIN}"
         ) from error
+    if kind != str(TensorDict):
+        raise ValueError(
+            f"{meta} describes a {kind}, expected a TensorDict: store plain tensordicts"
+        )
     for key, entry in content.items():
         if not isinstance(entry, dict):
             continue
         name = file_name(key)
-        if entry.get("type") is not None:
-            if entry["type"] == "TensorDict":
-                _check_folder(folder / name, root)
-            continue
-        file = folder / f"{name}.memmap"
-        if not file.exists():
-            raise ValueError(f"{root} is incomplete, {file} is missing: {again}")
-        expected = _bytes(entry)
-        if expected is not None and file.stat().st_size != expected:
+        if entry.get("type") == "TensorDict":
+            _check_folder(folder / name, root)
+        elif entry.get("type") is not None:
+            # Its content may be a pickle, which could execute anything.
             raise ValueError(
-                f"{file} has {file.stat().st_size} bytes, expected {expected} "
-                f"({entry['dtype']} {entry['shape']}): {again}"
+                f"{meta} has a {entry['type']} in {key!r}, expected tensors alone: "
+                "leave it out with exclude() before the data are stored"
             )
+        else:
+            _check_leaf(folder / f"{name}.memmap", entry, shape, meta, key)
     return shape
 
 
-def _bytes(entry: dict[str, Any]) -> int | None:
-    dtype = getattr(torch, str(entry.get("dtype")).removeprefix("torch."), None)
-    shape = entry.get("shape")
-    if not isinstance(dtype, torch.dtype) or not isinstance(shape, list):
-        return None
-    return dtype.itemsize * math.prod(shape)
+def _check_leaf(
+    file: Path, entry: dict[str, Any], batch: list[int], meta: Path, key: str
+) -> None:
+    """Checks that a leaf's file has the size that its dtype and shape say."""
+    try:
+        dtype = getattr(torch, str(entry["dtype"]).removeprefix("torch."))
+        shape = _shape(entry["shape"])
+        if not isinstance(dtype, torch.dtype) or entry.get("is_nested"):
+            raise ValueError(f"{entry} is not a dense tensor")
+        if shape[: len(batch)] != batch:
+            raise ValueError(
+                f"shape {shape} does not begin with the batch size {batch}"
+            )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{meta} has an unreadable description of {key!r} ({error}): {_AGAIN}"
+        ) from error
+    if not file.exists():
+        raise ValueError(f"{meta.parent} is incomplete, {file} is missing: {_AGAIN}")
+    expected = dtype.itemsize * math.prod(shape)
+    if file.stat().st_size != expected:
+        raise ValueError(
+            f"{file} has {file.stat().st_size} bytes, expected {expected} ({dtype} "
+            f"{shape}): {_AGAIN}"
+        )
+
+
+def _shape(value: Any) -> list[int]:
+    if not isinstance(value, list) or not all(type(x) is int and x >= 0 for x in value):
+        raise ValueError(f"{value!r} is not a shape")
+    return value

@@ -15,6 +15,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_caiac._keys import as_key
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.mark_unscored import set_unscored
 from torchrl_caiac.transforms.checks import (
     BatchCheck,
     check_generator,
@@ -319,11 +320,7 @@ class CounterfactualTransform(Transform, ABC):
         return out
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # A score is good for one place in one trajectory: an incoming one must not
-        # pass for the new row's, nor must that of the row that is replaced.
-        shape = (*tensordict.batch_size, *self.feature_shape)
-        unscored = torch.full(shape, math.nan, device=tensordict.device)
-        return tensordict.set(self.score_key, unscored)
+        return set_unscored(tensordict, self.score_key, self.feature_shape)
 
     def _scores(self, td: TensorDictBase) -> torch.Tensor:
         if td.ndim != 1 or not td.shape[0]:
