@@ -22,7 +22,7 @@ from torchrl_caiac.evaluation import Candidate, compare_influence
 
 
 def candidates(cfg: DictConfig) -> dict[str, Candidate]:
-    """The estimators of the methods."""
+    """Returns the estimators of the methods."""
     scoring = make_scoring(cfg)
     return {
         name: Candidate(

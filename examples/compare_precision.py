@@ -20,7 +20,7 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 
 def read_curves(path: Path) -> tuple[list[int], list[list[float]]]:
-    """The steps ``[P]`` of one method's study, and full success ``[R, P]`` by seed."""
+    """Reads the steps ``[P]`` of a study, and full success ``[R, P]`` by seed."""
     runs: dict[int, dict[int, float]] = defaultdict(dict)
     with path.open(newline="") as file:
         for row in csv.DictReader(file):

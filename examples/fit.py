@@ -29,7 +29,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def make_gaussian(environment: Environment, settings: DictConfig) -> GaussianWorldModel:
-    """The Gaussian world model of an environment."""
+    """Returns the Gaussian world model of an environment."""
     return GaussianWorldModel(
         environment.layout,
         environment.action_dim,
@@ -43,7 +43,7 @@ def make_gaussian(environment: Environment, settings: DictConfig) -> GaussianWor
 def make_transformer(
     environment: Environment, settings: DictConfig
 ) -> TransformerWorldModel:
-    """The transformer of an environment."""
+    """Returns the transformer of an environment."""
     return TransformerWorldModel(
         environment.layout,
         environment.action_dim,
@@ -106,7 +106,7 @@ def fit_model(cfg: DictConfig, name: str) -> Any:
 
 
 def fit_seconds(cfg: DictConfig, name: str) -> float:
-    """The processor time that fitting a model took; NaN if it was interrupted."""
+    """Returns the processor time of a fit; NaN if it was interrupted."""
     path = make_environment(cfg).folder / f"{name}_fit.json"
     return json.loads(path.read_text())["seconds"] if path.exists() else math.nan
 

@@ -29,7 +29,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def make_scoring(cfg: DictConfig) -> Scoring:
-    """What methods make their estimators of."""
+    """Returns what methods make their estimators of."""
     return Scoring(
         make_environment(cfg), partial(fit_model, cfg), cfg.env.score, progress()
     )

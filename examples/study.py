@@ -57,7 +57,7 @@ def run(
 
 
 def share_swapped(cfg: DictConfig, method: str) -> float:
-    """The share of all sampled rows in which at least one entity is swapped."""
+    """Returns the share of sampled rows in which an entity is swapped."""
     learner = make_learner(cfg, method)
     rb = learner.make_buffer(learner.rows())
     torch.manual_seed(0)
@@ -68,7 +68,7 @@ def share_swapped(cfg: DictConfig, method: str) -> float:
 def result_rows(
     cfg: DictConfig, evaluations: Sequence[Evaluation]
 ) -> list[dict[str, Any]]:
-    """The table of results, one or several rows a policy."""
+    """Returns the table of results, one or several rows a policy."""
     environment = make_environment(cfg)
     return [
         {
@@ -92,7 +92,7 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def influence_table(cfg: DictConfig, report: dict[str, Any]) -> list[str]:
-    """How well the scores find what the action moves, on unseen data."""
+    """Reports how well the scores find what the action moves, on unseen data."""
     lines = [
         "influence on unseen data",
         f"  {'':<22}{'AUC':>7}{'influenced':>12}{'score <= θ':>12}"
@@ -131,7 +131,7 @@ def report_table(
     swapped: dict[str, float],
     evaluations: Sequence[Evaluation],
 ) -> str:
-    """The table of one fraction of the data."""
+    """Returns the table of one fraction of the data."""
     lines = []
     if "fraction" in cfg.env:
         lines += [f"{100 * cfg.env.fraction:g} % of the data", ""]
@@ -149,7 +149,7 @@ def report_table(
 
 
 def draw_curves(cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path) -> None:
-    """Success along training, of the policies that were evaluated."""
+    """Draws success along training, of the policies that were evaluated."""
     steps, key = policy_steps(cfg), make_environment(cfg).success_key
     success = {
         (e.method, e.seed, e.step): float(np.mean([p[key] for p in e.episodes]))
@@ -172,7 +172,7 @@ def draw_curves(cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path) 
 def draw_success(
     cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path
 ) -> None:
-    """The success of all methods."""
+    """Draws the success of all methods."""
     environment, steps = make_environment(cfg), last_policies(cfg)
     bars = {
         method: environment.bars(
@@ -185,7 +185,7 @@ def draw_success(
 
 
 def parts_of(cfg: DictConfig) -> list[DictConfig]:
-    """The configurations of all fractions of the data."""
+    """Returns the configurations of all fractions of the data."""
     if cfg.study.fractions is None:
         return [cfg]
     return [

@@ -68,7 +68,7 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
 
 
 def load_policy(cfg: DictConfig, method: str, seed: int, step: int) -> Any:
-    """The policy of a run after some steps."""
+    """Returns the policy of a run after some steps."""
     path = policy_file(cfg, method, seed, step)
     learner = make_learner(cfg, method)
     try:

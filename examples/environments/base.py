@@ -80,30 +80,30 @@ class Environment(ABC):
 
     @abstractmethod
     def rows(self) -> TensorDictBase:
-        """The transitions to learn from, ``[T]``, memory-mapped; scores are added."""
+        """Returns the transitions to learn from, ``[T]``, memory-mapped."""
 
     def goal_rows(self) -> TensorDictBase:
-        """The same transitions with desired goals and rewards."""
+        """Returns the same transitions with desired goals and rewards."""
         return self.rows()
 
     def model_rows(self) -> list[TensorDictBase]:
-        """The data sets that world models are fitted to."""
+        """Returns the data sets that world models are fitted to."""
         return [self.rows()]
 
     def held_out(self) -> TensorDictBase:
-        """Transitions that nothing learns from, memory-mapped, to check the scores."""
+        """Returns transitions that nothing learns from, to check the scores."""
         return load_transitions(self.out / "held_out")
 
     @abstractmethod
     def simulator(self, num_actions: int) -> Any:
-        """The estimator that queries the simulator with some actions a state."""
+        """Returns the estimator that queries the simulator, some actions a state."""
 
     @abstractmethod
     def distance_rule(self, *, action_only: bool) -> Any:
-        """The estimator that calls entities linked that are close to each other."""
+        """Returns the estimator that links entities which are close to each other."""
 
     def ground_truth(self, *, progress: bool = False) -> torch.Tensor:
-        """What the action can move in the held-out states, bool ``[T, N]``."""
+        """Returns what the action can move in the held-out states, bool ``[T, N]``."""
         held_out = self.held_out()
         score_buffer(
             offline_buffer(held_out, batch_size=1),
@@ -130,19 +130,19 @@ class Environment(ABC):
 
     @abstractmethod
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """The lines of the table of results that belong to one policy."""
+        """Returns the lines of the table of results that belong to one policy."""
 
     @abstractmethod
     def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """The success of one method: groups of bars, each with independent results."""
+        """Returns the success of a method: groups of independent results."""
 
     @abstractmethod
     def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """The lines that report the success of all methods."""
+        """Returns the lines that report the success of all methods."""
 
     @abstractmethod
     def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """The answer of a study in one line."""
+        """Returns the answer of a study in one line."""
 
     def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
         """Draws figures of its own. Defaults to none.
@@ -164,4 +164,4 @@ def compare_methods(shares: Mapping[str, str]) -> str:
     """Joins the results of methods: ``"0/40 without, 40/40 with counterfactuals"``."""
     if {"none", "caiac"} <= shares.keys():
         return f"{shares['none']} without, {shares['caiac']} with counterfactuals"
-    return ", ".join(f"{share} {name}" for name, share in shares.items())
+    return ", ".join(f"{share} ({name})" for name, share in shares.items())

@@ -94,11 +94,11 @@ class FetchPush(Environment):
                 )
 
     def rows(self) -> TensorDictBase:
-        """The fraction of the expert's and the random episodes."""
+        """Returns the fraction of the expert's and the random episodes."""
         return load_transitions(self.folder / "rows")
 
     def simulator(self, num_actions: int) -> SimulatorInfluence:
-        """The simulator as an estimator."""
+        """Returns the simulator as an estimator."""
         return SimulatorInfluence(
             FetchPushTruth,
             state_key=("info", "simulator"),
@@ -109,7 +109,7 @@ class FetchPush(Environment):
         )
 
     def distance_rule(self, *, action_only: bool) -> DistanceInfluence:
-        """The rule of distance between the gripper and the cubes."""
+        """Returns the rule of distance between the gripper and the cubes."""
         positions = {name: LAYOUT.columns[name][:3] for name in LAYOUT.names}
         return DistanceInfluence(LAYOUT, positions, action_only=action_only)
 
@@ -124,11 +124,11 @@ class FetchPush(Environment):
         )
 
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """One line a policy: the shares of its episodes."""
+        """Returns one line a policy: the shares of its episodes."""
         return [{name: _mean(evaluation, name) for name in MEASURES}]
 
     def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Mean success of each run, by the fraction of the data."""
+        """Returns mean success of each run, by the fraction of the data."""
         return {
             f"{100 * fraction:g} % of the data": _by_seed(
                 [e for e in evaluations if e.fraction == fraction], "full"
@@ -137,7 +137,7 @@ class FetchPush(Environment):
         }
 
     def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Success by method, and CAIAC's difference to the others."""
+        """Returns success by method, and CAIAC's difference to the others."""
         steps = sorted({e.step for e in evaluations})
         lines = [
             f"success in {self.settings.evaluate.episodes} episodes, mean of the "
@@ -167,7 +167,7 @@ class FetchPush(Environment):
         return lines
 
     def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """The share of episodes in which both cubes reach their goals."""
+        """Returns the share of episodes in which both cubes reach their goals."""
         shares = {
             method: f"{100 * np.mean(_by_seed(mine, 'full')):.1f} %"
             for method, mine in _by_method(evaluations).items()
@@ -225,7 +225,7 @@ def _by_method(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]
 
 
 def _by_seed(evaluations: Sequence[Evaluation], measure: str) -> list[float]:
-    """Means over the policies of each run."""
+    """Returns means over the policies of each run."""
     return [
         float(np.mean([_mean(e, measure) for e in evaluations if e.seed == seed]))
         for seed in sorted({e.seed for e in evaluations})
@@ -233,6 +233,6 @@ def _by_seed(evaluations: Sequence[Evaluation], measure: str) -> list[float]:
 
 
 def _by_start(evaluations: Sequence[Evaluation]) -> np.ndarray:
-    """Full success from each start, mean over seeds and policies."""
+    """Returns full success from each start, mean over seeds and policies."""
     played = [[episode["full"] for episode in e.episodes] for e in evaluations]
     return np.mean(played, axis=0)

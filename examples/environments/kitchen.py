@@ -55,7 +55,7 @@ class Kitchen(Environment):
 
     @staticmethod
     def reward_fn(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
-        """0 where all objects are at their goals, else -1."""
+        """Returns 0 where all objects are at their goals, else -1."""
         return kitchen_reward(achieved, desired) - 1.0
 
     def collect(self, *, progress: bool = False) -> None:
@@ -100,11 +100,11 @@ class Kitchen(Environment):
         )[0]
 
     def rows(self) -> TensorDictBase:
-        """The demonstrations."""
+        """Returns the demonstrations."""
         return load_transitions(self.out / "demonstrations")
 
     def goal_rows(self) -> TensorDictBase:
-        """The demonstrations, whose goal is the last state of each."""
+        """Returns the demonstrations, whose goal is the last state of each."""
         rows = self.rows()
         achieved = LAYOUT.achieved_goal(rows, next=True)
         index = trajectory_index(rows)
@@ -115,11 +115,11 @@ class Kitchen(Environment):
         return rows
 
     def model_rows(self) -> list[TensorDictBase]:
-        """The demonstrations and the random actions."""
+        """Returns the demonstrations and the random actions."""
         return [self.rows(), load_transitions(self.out / "random")]
 
     def simulator(self, num_actions: int) -> SimulatorInfluence:
-        """The simulator as an estimator."""
+        """Returns the simulator as an estimator."""
         return SimulatorInfluence(
             KitchenEnv,
             state_key=[("sim", "qpos"), ("sim", "qvel")],
@@ -129,7 +129,7 @@ class Kitchen(Environment):
         )
 
     def distance_rule(self, *, action_only: bool) -> HandleDistance:
-        """The rule of distance between the hand and the handles of objects."""
+        """Returns the rule of distance between the hand and the handles of objects."""
         return HandleDistance(action_only=action_only)
 
     def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
@@ -149,21 +149,21 @@ class Kitchen(Environment):
         return episodes
 
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """One line an episode."""
+        """Returns one line an episode."""
         return [
             {**episode, "wrong_tasks": " ".join(episode["wrong_tasks"])}
             for episode in evaluation.episodes
         ]
 
     def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Success of all episodes, by task."""
+        """Returns success of all episodes, by task."""
         return {
             task: [float(e["success"]) for e in _of_task(evaluations, task)]
             for task in self.settings.evaluate.tasks
         }
 
     def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Success by method and task, and which wrong tasks were done."""
+        """Returns success by method and task, and which wrong tasks were done."""
         lines = [
             "success over all objects, 95 % interval over episodes; over the task's own"
         ]
@@ -188,13 +188,13 @@ class Kitchen(Environment):
         return lines
 
     def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """The solved episodes of the task that the study is about, or of all tasks."""
-        asked = self.settings.answer
+        """Returns the solved episodes of the study's task, or of all tasks."""
+        question = self.settings.answer
         shares = {}
         for method in _methods(evaluations):
-            mine = _of_task(evaluations, asked.task, method)
+            mine = _of_task(evaluations, question.task, method)
             shares[method] = f"{sum(e['success'] for e in mine)}/{len(mine)}"
-        return f"{asked.text}: {compare_methods(shares)}"
+        return f"{question.text}: {compare_methods(shares)}"
 
     def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
         """Draws the influence along a demonstration, and counterfactual frames."""
@@ -208,7 +208,7 @@ class Kitchen(Environment):
         return []
 
     def _draw_influence(self, path: Path, threshold: float) -> None:
-        """Fig. 6: the influence on every entity along a held-out demonstration."""
+        """Draws the influence along a held-out demonstration (Fig. 6)."""
         data = self.held_out()
         scores = torch.load(self.folder / "held_out_scores.pt", weights_only=True)
         rows = data["episode"] == self.settings.influence_episode
@@ -225,7 +225,7 @@ class Kitchen(Environment):
         ).savefig(path, dpi=150)
 
     def _draw_counterfactuals(self, path: Path, threshold: float) -> None:
-        """Fig. 1: a frame of a demonstration of each task, and its counterfactual."""
+        """Draws a frame of a demonstration of each task, and its counterfactual."""
         data = self.rows()
         torch.manual_seed(0)
         copies = 64
@@ -276,13 +276,13 @@ class HandleDistance:
         self._kitchen = KitchenEnv()
 
     def __call__(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """Scores of 0 or 1, see :class:`~torchrl_caiac.influence.DistanceInfluence`."""
+        """Scores rows by the rule."""
         places = self._kitchen.handle_positions(tensordict["observation"])
         handles = torch.from_numpy(places).flatten(1).float()
         return self._rule(TensorDict({"handles": handles}, tensordict.batch_size))
 
     def __repr__(self) -> str:
-        """The rule that the scores depend on."""
+        """Returns the rule that the scores depend on."""
         return f"{type(self).__name__}({self._rule!r})"
 
 
@@ -358,7 +358,7 @@ def _methods(evaluations: Sequence[Evaluation]) -> list[str]:
 def _of_task(
     evaluations: Sequence[Evaluation], task: str | None, method: str | None = None
 ) -> list[dict[str, Any]]:
-    """The episodes of a task and a method; ``None`` for all."""
+    """Returns the episodes of a task and a method; ``None`` for all."""
     return [
         episode
         for evaluation in evaluations

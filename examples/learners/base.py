@@ -49,7 +49,7 @@ class Learner(ABC):
         self.parts: dict[str, Any] = {}
 
     def kept_settings(self) -> dict[str, Any]:
-        """What the results of a run depend on."""
+        """Returns what the results of a run depend on."""
         settings: dict[str, Any] = OmegaConf.to_container(self.settings, resolve=True)
         if self.extendable:
             settings.pop("steps")
@@ -60,12 +60,12 @@ class Learner(ABC):
         }
 
     def rows(self) -> TensorDictBase:
-        """The rows to learn from. Defaults to those of the environment."""
+        """Returns the rows to learn from, by default those of the environment."""
         return self.environment.rows()
 
     @abstractmethod
     def make_buffer(self, rows: TensorDictBase) -> ReplayBuffer:
-        """The replay buffer: rows, the method's transform, and goals."""
+        """Makes the replay buffer: rows, the method's transform, and goals."""
 
     @abstractmethod
     def setup(self, rows: TensorDictBase, seed: int) -> None:
@@ -77,7 +77,7 @@ class Learner(ABC):
 
     @abstractmethod
     def batches(self) -> Iterator[TensorDictBase]:
-        """Batches without end."""
+        """Yields batches without end."""
 
     @abstractmethod
     def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
@@ -93,14 +93,14 @@ class Learner(ABC):
 
     @abstractmethod
     def policy_state(self) -> dict[str, Any]:
-        """The state of the policy, tensors alone."""
+        """Returns the state of the policy, tensors alone."""
 
     @abstractmethod
     def load_policy(self, state: dict[str, Any]) -> Any:
-        """The policy of a state, for evaluation, without :meth:`setup`."""
+        """Returns the policy of a state, for evaluation, without :meth:`setup`."""
 
     def share_swapped(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
-        """The share of rows with a swap, for the log; empty without augmentation."""
+        """Returns the share of rows with a swap, for the log, if there are any."""
         swapped = batch.get(("caiac", "swapped"), None)
         if swapped is None:
             return {}

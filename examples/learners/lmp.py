@@ -26,7 +26,7 @@ class LMP(Learner):
     """Plans for windows of trajectories, whose goals are later states."""
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
-        """Windows, their goals, and counterfactuals."""
+        """Makes the buffer of windows, their goals, and counterfactuals."""
         settings, layout = self.settings, self.environment.layout
         goals = WindowGoal(
             layout,
@@ -88,7 +88,7 @@ class LMP(Learner):
         }
 
     def make_model(self) -> LMPModel:
-        """The model, without statistics."""
+        """Returns the model, without statistics."""
         settings, layout = self.settings, self.environment.layout
         return LMPModel(
             observation_dim=sum(layout.widths().values()),
@@ -103,7 +103,7 @@ class LMP(Learner):
         )
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Batches of windows, ``[windows * window]``."""
+        """Yields batches of windows, ``[windows * window]``."""
         while True:
             yield self.rb.sample()
 
@@ -119,7 +119,7 @@ class LMP(Learner):
         return scalars | self.share_swapped(batch)
 
     def policy_state(self) -> dict[str, Any]:
-        """The model's."""
+        """Returns the state of the model."""
         return self.model.state_dict()
 
     def load_policy(self, state: dict[str, Any]) -> LMPActor:

@@ -32,7 +32,7 @@ class TD3(Learner):
     extendable = True
 
     def rows(self) -> TensorDictBase:
-        """The leaves that learning reads, in memory."""
+        """Returns the leaves that learning reads, in memory."""
         keys = [
             "observation",
             "desired_goal",
@@ -44,7 +44,7 @@ class TD3(Learner):
         return self.environment.goal_rows().select(*keys).clone()
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
-        """Transitions, counterfactuals, and hindsight goals.
+        """Makes the buffer of transitions, counterfactuals, and hindsight goals.
 
         Without augmentation there are as many random goals as counterfactuals would
         have (A.5.2).
@@ -122,13 +122,13 @@ class TD3(Learner):
         self.parts = {"loss": self.loss_module, **self.optimizers}
 
     def make_features(self) -> GoalFeatures:
-        """What the networks read: relative positions and the goals too."""
+        """Makes what the networks read: relative positions and goals too."""
         return GoalFeatures(
             self.environment.layout, reference=self.environment.goal_reference
         )
 
     def make_actor(self, features: GoalFeatures) -> GoalConditionedActor:
-        """The policy."""
+        """Returns the policy."""
         return GoalConditionedActor(
             features,
             self.environment.action_dim,
@@ -141,7 +141,7 @@ class TD3(Learner):
         return None if name == "float32" else getattr(torch, name)
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Batches, several of which are one sample, which saves time."""
+        """Yields batches, several of one sample, which saves time."""
         at_once = self.settings.batches_at_once
         while True:
             rows = self.rb.sample()
@@ -166,11 +166,11 @@ class TD3(Learner):
         return scalars | self.share_swapped(batch)
 
     def policy_state(self) -> dict[str, Any]:
-        """The policy's."""
+        """Returns the state of the policy."""
         return self.actor.state_dict()
 
     def load_policy(self, state: dict[str, Any]) -> GoalConditionedActor:
-        """The policy."""
+        """Returns the policy."""
         actor = self.make_actor(self.make_features())
         actor.load_state_dict(state)
         return actor.eval()

@@ -54,14 +54,14 @@ class Method(ABC):
     """The leaf of its scores; ``None`` where it needs none."""
 
     def estimator(self, scoring: Scoring) -> Estimator:
-        """The estimator of its scores."""
+        """Returns the estimator of its scores."""
         raise NotImplementedError(f"{type(self).__name__} needs no scores")
 
     @abstractmethod
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
     ) -> Transform | None:
-        """The transform that it appends to a replay buffer; ``None`` for none."""
+        """Returns the transform that it appends to a replay buffer, if any."""
 
     def score(self, rb: ReplayBuffer, scoring: Scoring) -> None:
         """Writes its scores into a buffer; finished ones are skipped."""
@@ -75,6 +75,6 @@ class Method(ABC):
             )
 
     def scoring_options(self, scoring: Scoring) -> dict[str, Any]:
-        """The options of ``score_buffer``, those of ``env.score`` by default."""
+        """Returns options of ``score_buffer``, by default those of ``env.score``."""
         options = {key: scoring.settings[key] for key in ("batch_size", "lookahead")}
         return {**options, "smoothing": scoring.settings.smoothing}

@@ -27,14 +27,14 @@ class CAIAC(Method):
     threshold: float
 
     def estimator(self, scoring: Scoring) -> Estimator:
-        """CAI of the Gaussian world model."""
+        """Returns CAI of the Gaussian world model."""
         model = scoring.model("world_model")
         return CAI(model, num_actions=scoring.settings.num_actions)
 
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
     ) -> Transform | None:
-        """The transform."""
+        """Returns the transform."""
         return CAIACTransform(
             layout,
             self.threshold,

@@ -27,13 +27,13 @@ class CoDA(Method):
     threshold: float
 
     def estimator(self, scoring: Scoring) -> Estimator:
-        """The attention between all entities, and from the action."""
+        """Returns the attention between all entities, and from the action."""
         return AttentionInfluence(scoring.model("transformer"))
 
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
     ) -> Transform | None:
-        """The transform."""
+        """Returns the transform."""
         return CoDATransform(
             layout,
             self.threshold,

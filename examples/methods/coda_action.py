@@ -19,5 +19,5 @@ class CoDAAction(CAIAC):
     score_key = ("coda", "action")
 
     def estimator(self, scoring: Scoring) -> Estimator:
-        """The attention that entities pay to the action."""
+        """Returns the attention that entities pay to the action."""
         return AttentionInfluence(scoring.model("transformer"), action_only=True)

@@ -24,9 +24,9 @@ class Distance(CoDA):
     threshold: float = 0.5
 
     def scoring_options(self, scoring: Scoring) -> dict[str, Any]:
-        """No smoothing."""
+        """Returns options without smoothing."""
         return {**super().scoring_options(scoring), "smoothing": 1}
 
     def estimator(self, scoring: Scoring) -> Estimator:
-        """The rule between all entities."""
+        """Returns the rule between all entities."""
         return scoring.environment.distance_rule(action_only=False)

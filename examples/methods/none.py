@@ -18,5 +18,5 @@ class NoAugmentation(Method):
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
     ) -> Transform | None:
-        """No transform."""
+        """Returns no transform."""
         return None

@@ -31,11 +31,11 @@ class Oracle(CAIAC):
     batch_size: int = 10_000
 
     def estimator(self, scoring: Scoring) -> Estimator:
-        """The simulator."""
+        """Returns the simulator."""
         return scoring.environment.simulator(self.num_actions)
 
     def scoring_options(self, scoring: Scoring) -> dict[str, Any]:
-        """No smoothing, and only some rows."""
+        """Returns options without smoothing, for some rows only."""
         return {
             "batch_size": self.batch_size,
             "lookahead": scoring.settings.lookahead,

@@ -18,6 +18,6 @@ class RelabelOnly(CAIAC):
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
     ) -> Transform | None:
-        """CAIAC's transform, which marks transitions and swaps nothing."""
+        """Returns CAIAC's transform, which flags transitions and swaps nothing."""
         options["swap_prob"] = 0.0
         return super().transform(layout, counterfactual_ratio, **options)

@@ -25,12 +25,12 @@ _FORMAT = "%(asctime)s %(name)s: %(message)s"
 
 
 def progress() -> bool:
-    """Whether progress bars are shown: only on a terminal."""
+    """Returns whether progress bars are shown: only on a terminal."""
     return sys.stderr is not None and sys.stderr.isatty()
 
 
 def progress_bar(**options: Any) -> tqdm:
-    """A progress bar of a run, in a process of its own perhaps."""
+    """Returns a progress bar of a run, in a process of its own perhaps."""
     file: TextIO | None = None
     if not progress() and _TERMINAL in os.environ:
         file = Path("/dev/tty").open("w")  # noqa: SIM115 - closed with the process
@@ -128,7 +128,9 @@ class Console:
 
 
 @contextmanager
-def start(cfg: DictConfig, *, folder: Path | None = None, stages: int = 1) -> Any:
+def start(
+    cfg: DictConfig, *, folder: Path | None = None, stages: int = 1
+) -> Iterator[Console]:
     """Begins a script: claims its output folder, and opens its console there.
 
     Args:

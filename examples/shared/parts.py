@@ -33,7 +33,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def make_environment(cfg: DictConfig) -> Environment:
-    """The environment ``cfg.env``."""
+    """Returns the environment ``cfg.env``."""
     # Some packages print notices when they are imported.
     with redirect_stderr(io.StringIO()) as notices:
         kind = get_class(cfg.env._target_)
@@ -43,7 +43,7 @@ def make_environment(cfg: DictConfig) -> Environment:
 
 
 def make_method(cfg: DictConfig, name: str) -> Method:
-    """A method of ``cfg.method``."""
+    """Returns a method of ``cfg.method``."""
     if name not in cfg.method:
         raise ValueError(
             f"the method {name!r} is not configured, got {list(cfg.method)}: add it "
@@ -53,12 +53,12 @@ def make_method(cfg: DictConfig, name: str) -> Method:
 
 
 def make_methods(cfg: DictConfig) -> dict[str, Method]:
-    """All methods of ``cfg.method`` by name."""
+    """Returns all methods of ``cfg.method`` by name."""
     return {name: make_method(cfg, name) for name in cfg.method}
 
 
 def make_learner(cfg: DictConfig, method: str) -> Learner:
-    """The learner ``cfg.learner`` for one of the methods."""
+    """Returns the learner ``cfg.learner`` for one of the methods."""
     return get_class(cfg.learner._target_)(
         cfg.learner,
         make_environment(cfg),
@@ -68,17 +68,17 @@ def make_learner(cfg: DictConfig, method: str) -> Learner:
 
 
 def run_folder(cfg: DictConfig, method: str, seed: int) -> Path:
-    """The folder of a run: its checkpoint, policies, log and evaluation."""
+    """Returns the folder of a run: its checkpoint, policies, log and evaluation."""
     return make_environment(cfg).folder / "runs" / f"{method}-seed{seed}"
 
 
 def policy_file(cfg: DictConfig, method: str, seed: int, step: int) -> Path:
-    """The file of the policy after some steps."""
+    """Returns the file of the policy after some steps."""
     return run_folder(cfg, method, seed) / "policies" / f"{step}.pt"
 
 
 def policy_steps(cfg: DictConfig) -> list[int]:
-    """The training steps after which policies are evaluated."""
+    """Returns the training steps after which policies are evaluated."""
     last = cfg.learner.steps
     every = cfg.learner.keep_every or last
     kept = range(every, last + 1, every)
@@ -95,5 +95,5 @@ def policy_steps(cfg: DictConfig) -> list[int]:
 
 
 def last_policies(cfg: DictConfig) -> list[int]:
-    """The steps of the policies whose mean is the result of a run."""
+    """Returns the steps of the policies whose mean is the result of a run."""
     return policy_steps(cfg)[-cfg.env.evaluate.last :]

@@ -56,7 +56,7 @@ def keep_settings(
 
 
 def _differences(one: Any, other: Any, prefix: str = "") -> list[str]:
-    """The dotted names under which two mappings differ."""
+    """Returns the dotted names under which two mappings differ."""
     if not (isinstance(one, dict) and isinstance(other, dict)):
         return [] if one == other else [prefix]
     names: list[str] = []

@@ -121,7 +121,7 @@ _READ = {
 
 
 def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    """The rows over all entities, one experiment after another."""
+    """Returns the rows over all entities, one experiment after another."""
     lines: list[str] = []
     experiment = None
     for row in rows:

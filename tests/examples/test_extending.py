@@ -157,6 +157,6 @@ def test_a_method_and_a_learner_of_one_file_each(tmp_path):
     lines = run.stdout.rstrip().splitlines()
     assert all(line.startswith(f"[{n}/5] ") for n, line in enumerate(lines[:5], 1))
     assert lines[-1].startswith("both cubes at their goals: ")
-    assert lines[-1].endswith("% swap_anything")
+    assert lines[-1].endswith("% (swap_anything)")
     results = json.loads((out / "fetch_push.json").read_text())["results"]
     assert [r["method"] for r in results] == ["caiac", "swap_anything"]

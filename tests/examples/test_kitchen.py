@@ -225,6 +225,6 @@ def test_all_tasks(tmp_path, steps, compose, monkeypatch):
     assert "caiac        kettle" in table
     assert "rows with a swap: caiac 50.0% (counterfactual: 80%)" in table
     solved = sum(episode["success"] for episode in evaluations[0].episodes)
-    assert environment.answer(evaluations) == f"all tasks: {solved}/1 caiac"
+    assert environment.answer(evaluations) == f"all tasks: {solved}/1 (caiac)"
     environment.draw(tmp_path, "small", threshold=0.2)
     assert (tmp_path / "small_influence.png").stat().st_size > 10_000
