@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import warnings
 from pathlib import Path
@@ -32,7 +33,7 @@ from torchrl_caiac.modules import (
     TransformerWorldModel,
 )
 from torchrl_caiac.objectives import GoalConditionedTD3Loss
-from torchrl_caiac.transforms import HindsightGoal, WindowGoal
+from torchrl_caiac.transforms import HindsightGoal, TransformKeys, WindowGoal
 
 ROOT = Path(__file__).parents[1]
 
@@ -111,6 +112,7 @@ def run_usage(start: str, **given: object) -> dict[str, object]:
         "HindsightGoal": HindsightGoal,
         "SliceSampler": SliceSampler,
         "SoftUpdate": SoftUpdate,
+        "TransformKeys": TransformKeys,
         "TensorStorage": TensorStorage,
         "WindowGoal": WindowGoal,
         "layout": LAYOUT,
@@ -257,6 +259,32 @@ def test_new_estimator(flat_data: TensorDictBase) -> None:
     score = rb.storage[:]["caiac", "score"]
     moved = (flat_data["next", "observation"] - flat_data["observation"]).abs()
     torch.testing.assert_close(score[:, 1], moved[:, 3:6].amax(-1))
+
+
+@in_memory
+def test_other_keys(flat_data: TensorDictBase) -> None:
+    flat_data["collector", "traj_ids"] = flat_data.pop("episode")
+    rb = offline_buffer(flat_data, batch_size=8)
+    run_usage("keys = ", rb=rb, estimator=CAI(GaussianWorldModel(LAYOUT, 2, (16, 16))))
+    assert rb.sample()["caiac", "counterfactual"].sum() == 4
+
+
+def test_table_of_subpackages() -> None:
+    """The names in the README's table are public names of their subpackages."""
+    text = (ROOT / "README.md").read_text()
+    table = text.split("| subpackage | contents |\n|---|---|\n")[1].split("\n\n")[0]
+    for row in table.splitlines():
+        places, names = row.strip("| ").split(" | ")
+        public = [
+            name
+            for place in re.findall(r"`([\w.]+)`", places)
+            for name in importlib.import_module(
+                place if place.startswith("torchrl") else f"torchrl_caiac{place}"
+            ).__all__
+        ]
+        named = re.findall(r"`(\w+)`", names)
+        assert named
+        assert not set(named) - set(public), places
 
 
 def test_citation_has_the_version() -> None:
