@@ -103,7 +103,7 @@ def run_in_processes(
         {0: 5.0, 1: 13.0}
     """
     if processes < 0:
-        raise ValueError(f"processes is {processes}, wanted at least 0")
+        raise ValueError(f"processes is {processes}, expected at least 0")
     if processes == 0:
         yield from _run_here(function, jobs, setup)
         return

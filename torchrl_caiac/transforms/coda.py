@@ -98,7 +98,7 @@ class CoDATransform(CounterfactualTransform):
 
     draw_in_batch = staticmethod(draw_batch_components)
     donors_class = ComponentDonors
-    _wanted = "a score from each entity and the action to each of"
+    _expected = "a score from each entity and the action to each of"
 
     def __init__(
         self,

@@ -65,7 +65,7 @@ class CounterfactualTransform(Transform, ABC):
     #: Draws among the windows of the batch, from what :meth:`swappable` returned.
     draw_in_batch: ClassVar[Callable[..., SwapDraw]]
     donors_class: ClassVar[type[BufferDonors]] = BufferDonors
-    _wanted: ClassVar[str] = "one score for each of"
+    _expected: ClassVar[str] = "one score for each of"
 
     def __init__(
         self,
@@ -353,7 +353,7 @@ class CounterfactualTransform(Transform, ABC):
         if tuple(scores.shape) != expected:
             raise ValueError(
                 f"{self.score_key!r} has shape {list(scores.shape)}, expected "
-                f"{list(expected)}: {self._wanted} the entities "
+                f"{list(expected)}: {self._expected} the entities "
                 f"{list(self.layout.names)}"
             )
         return scores
