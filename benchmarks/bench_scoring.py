@@ -7,9 +7,9 @@ How near to the threshold states are decides how fast the fast mode is, so the s
 are real: a few episodes of the scripted experts and of random actions, which the models
 are fitted to first (about a minute a shape).
 
-The yardstick is eq. 3 as one would write it down, with all ``[B, K, K, d]`` tensors in
+The reference is eq. 3 as one would write it down, with all ``[B, K, K, d]`` tensors in
 memory, in float32 and for 256 states at once. In parts of 32 states, which stay in the
-cache, it is up to twice as fast: ``yardstick_of_32_states_per_s``. "Network" is the
+cache, it is up to twice as fast: ``reference_of_32_states_per_s``. "Network" is the
 plain forward pass of the same rows of states and actions, in such small parts.
 """
 
@@ -52,7 +52,7 @@ from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.objectives.entity_dynamics import gaussian_nll
 
 STATES = {"cpu": 1024, "cuda": 65_536}
-YARDSTICK = 256  # states at once
+REFERENCE = 256  # states at once
 SMALL = {"cpu": 32, "cuda": 1024}
 
 
@@ -141,7 +141,7 @@ def network(
     *,
     score: bool,
 ) -> None:
-    """The plain forward pass, and with ``score`` the yardstick."""
+    """The plain forward pass, and with ``score`` the reference."""
     for part in states.split(at_once):
         rows = part[:, None].expand(len(part), len(actions)).clone()
         rows["action"] = actions.expand(len(part), -1, -1)
@@ -179,8 +179,8 @@ def bench_estimator(
             "exact": lambda: exact(td),
             "fast": lambda: fast(td),
             "network": lambda: plain(small, score=False),
-            "yardstick": lambda: plain(YARDSTICK, score=True),
-            f"yardstick_of_{small}": lambda: plain(small, score=True),
+            "reference": lambda: plain(REFERENCE, score=True),
+            f"reference_of_{small}": lambda: plain(small, score=True),
         },
         rounds=5,
         warmup=1,
@@ -188,9 +188,9 @@ def bench_estimator(
     for what, took in spent.items():
         benchmark.extra_info[f"{what}_states_per_s"] = round(rows / took)
     for what, of, least in (
-        ("exact", "yardstick", 5),
+        ("exact", "reference", 5),
         ("exact", "network", 0.6),
-        ("fast", "yardstick", 12),
+        ("fast", "reference", 12),
     ):
         judge(f"{name}, {what} / {of}, rate", spent[of] / spent[what], at_least=least)
 

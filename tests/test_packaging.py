@@ -21,8 +21,8 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
-# A room is the package itself, a sub-package, or a public module beside them.
-ROOMS = sorted(
+# A module here is the package itself, a sub-package, or a public module beside them.
+MODULES = sorted(
     ["torchrl_caiac"]
     + [
         f"torchrl_caiac.{module.name}"
@@ -32,7 +32,9 @@ ROOMS = sorted(
     ]
 )
 PUBLIC = [
-    (room, name) for room in ROOMS for name in importlib.import_module(room).__all__
+    (module, name)
+    for module in MODULES
+    for name in importlib.import_module(module).__all__
 ]
 # None of these may be needed to import the core.
 OPTIONAL = (
@@ -116,13 +118,13 @@ def test_package_is_typed() -> None:
     assert (Path(torchrl_caiac.__file__).parent / "py.typed").is_file()
 
 
-@pytest.mark.parametrize(("room", "name"), PUBLIC)
-def test_public_names_have_a_docstring(room: str, name: str) -> None:
-    thing = getattr(importlib.import_module(room), name)
+@pytest.mark.parametrize(("module", "name"), PUBLIC)
+def test_public_names_have_a_docstring(module: str, name: str) -> None:
+    thing = getattr(importlib.import_module(module), name)
     if not (inspect.isclass(thing) or inspect.isroutine(thing)):
         return  # a constant: described where it is defined
     doc = inspect.getdoc(thing) or ""
-    assert len(doc) > 20, f"{room}.{name} has no docstring"
+    assert len(doc) > 20, f"{module}.{name} has no docstring"
     own = (
         [
             n
@@ -138,18 +140,18 @@ def test_public_names_have_a_docstring(room: str, name: str) -> None:
         for n in own
         if not n.startswith("_") and not inspect.getdoc(getattr(thing, n))
     ]
-    assert not bare, f"{room}.{name} has public methods without docstring: {bare}"
+    assert not bare, f"{module}.{name} has public methods without docstring: {bare}"
 
 
 def test_reference_lists_every_room() -> None:
-    """The names within a room come from its ``__all__``, see docs/_templates."""
+    """The names within a module come from its ``__all__``, see docs/_templates."""
     text = (ROOT / "docs" / "reference" / "index.rst").read_text()
     listed = re.findall(r"^   (torchrl_caiac[\w.]*)$", text, flags=re.MULTILINE)
-    assert sorted(listed) == sorted(ROOMS)
+    assert sorted(listed) == sorted(MODULES)
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_all_resolves(room: str) -> None:
-    module = importlib.import_module(room)
+@pytest.mark.parametrize("module", MODULES)
+def test_all_resolves(module: str) -> None:
+    module = importlib.import_module(module)
     assert len(module.__all__) == len(set(module.__all__))
     assert not [name for name in module.__all__ if not hasattr(module, name)]
