@@ -148,6 +148,11 @@ def report_table(
     return "\n".join(lines) + "\n"
 
 
+def method_labels(cfg: DictConfig) -> dict[str, str]:
+    """Returns the names of the methods in figures."""
+    return {name: m.label for name, m in make_methods(cfg).items() if m.label}
+
+
 def draw_curves(cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path) -> None:
     """Draws success along training, of the policies that were evaluated."""
     steps, key = policy_steps(cfg), make_environment(cfg).success_key
@@ -165,8 +170,9 @@ def draw_curves(cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path) 
     title = cfg.study.title
     if "fraction" in cfg.env:
         title = f"{title}, {100 * cfg.env.fraction:g} % of the data"
+    figure = plot_learning_curves(curves, labels=method_labels(cfg), title=title)
     with whole_file(path) as partial:
-        plot_learning_curves(curves, title=title).savefig(partial, dpi=150)
+        figure.savefig(partial, dpi=150)
 
 
 def draw_success(
@@ -180,8 +186,9 @@ def draw_success(
         )
         for method in cfg.method
     }
+    figure = plot_success(bars, labels=method_labels(cfg), title=cfg.study.title)
     with whole_file(path) as partial:
-        plot_success(bars, title=cfg.study.title).savefig(partial, dpi=150)
+        figure.savefig(partial, dpi=150)
 
 
 def parts_of(cfg: DictConfig) -> list[DictConfig]:

@@ -48,6 +48,8 @@ class Method(ABC):
     has its arguments, is all that a new method takes.
     """
 
+    label: ClassVar[str] = ""
+    """Its name in figures; empty for the name in the configuration."""
     models: ClassVar[tuple[str, ...]] = ()
     """The world models that are fitted for it."""
     score_key: ClassVar[NestedKey | None] = None

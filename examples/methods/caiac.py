@@ -22,6 +22,7 @@ class CAIAC(Method):
         threshold (float): an entity is swapped where its score is at most this.
     """
 
+    label = "with counterfactuals (CAIAC)"
     models = ("world_model",)
     score_key = ("caiac", "score")
     threshold: float

@@ -22,6 +22,7 @@ class CoDA(Method):
         threshold (float): entities are linked where the attention is above this.
     """
 
+    label = "CoDA"
     models = ("transformer",)
     score_key = ("coda", "graph")
     threshold: float

@@ -15,6 +15,7 @@ __all__ = ["CoDAAction"]
 class CoDAAction(CAIAC):
     """Swaps what the action does not influence, by a transformer's attention."""
 
+    label = "CoDA-action"
     models = ("transformer",)
     score_key = ("coda", "action")
 

@@ -19,6 +19,7 @@ class Distance(CoDA):
         threshold (float): between 0 and 1. Defaults to 0.5.
     """
 
+    label = "CoDA by distance"
     models = ()
     score_key = ("distance", "graph")
     threshold: float = 0.5

@@ -19,6 +19,7 @@ class DistanceAction(CAIAC):
         threshold (float): between 0 and 1. Defaults to 0.5.
     """
 
+    label = "CAIAC by distance"
     models = ()
     score_key = ("distance", "action")
     threshold: float = 0.5

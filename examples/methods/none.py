@@ -15,6 +15,8 @@ __all__ = ["NoAugmentation"]
 class NoAugmentation(Method):
     """Learns from the data as they are."""
 
+    label = "without counterfactuals"
+
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
     ) -> Transform | None:

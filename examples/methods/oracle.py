@@ -23,6 +23,7 @@ class Oracle(CAIAC):
         threshold (float): between 0 and 1. Defaults to 0.5.
     """
 
+    label = "with counterfactuals (ground truth)"
     models = ()
     score_key = ("oracle", "score")
     threshold: float = 0.5

@@ -15,6 +15,8 @@ __all__ = ["RelabelOnly"]
 class RelabelOnly(CAIAC):
     """Tells the effect of the swap from that of the relabelling."""
 
+    label = "relabelling alone"
+
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any
     ) -> Transform | None:
