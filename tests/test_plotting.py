@@ -148,6 +148,18 @@ CURVES = {
 }
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_the_legend_fits_into_the_figure(count):
+    names = [f"method {n}" for n in range(count)]
+    labels = {name: f"{name}, with a label that is rather long" for name in names}
+    results = {name: {"kettle": [1.0]} for name in names}
+    figure = plot_success(results, labels=labels)
+    figure.canvas.draw()
+    extent = figure.legends[0].get_window_extent()
+    assert extent.x0 >= 0 and extent.x1 <= figure.bbox.width
+    assert len(figure.legends) == 1 and len(legend(figure)) == count
+
+
 class TestLearningCurves:
     def test_lines_are_means_with_bands(self, tmp_path):
         figure = plot_learning_curves(

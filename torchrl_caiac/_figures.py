@@ -127,9 +127,13 @@ def finish_results(
     remove_frame(axes)
     axes.set_ylabel(ylabel)
     axes.grid(axis="y", color="#E5E5E5", linewidth=0.8)
-    figure.legend(
-        loc="outside lower center", ncols=min(methods, 4), frameon=False, fontsize=9
-    )
+    for columns in range(min(methods, 4), 0, -1):  # as many as the width allows
+        legend = figure.legend(
+            loc="outside lower center", ncols=columns, frameon=False, fontsize=9
+        )
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
     if title:
         axes.set_title(title, fontsize=11, loc="left")
     return figure

@@ -190,11 +190,11 @@ class GoalFeatures(TensorDictModuleBase):
         features = self._join(observation, goal)
         if params is None:
             return self.norm(features)
-        shift, gain = (params.get(("norm", name)) for name in ("shift", "gain"))
+        shift, divisor = (params.get(("norm", name)) for name in ("shift", "divisor"))
         if shift.ndim > 1:
             shape = (len(shift), *[1] * (features.ndim - 2), -1)
-            shift, gain = shift.reshape(shape), gain.reshape(shape)
-        return ((features - shift) * gain).to(shift.dtype)
+            shift, divisor = shift.reshape(shape), divisor.reshape(shape)
+        return ((features - shift) / divisor).to(shift.dtype)
 
     def fit_statistics(self, tensordict: TensorDictBase) -> GoalFeatures:
         """Takes the mean and the standard deviation of every feature from data.

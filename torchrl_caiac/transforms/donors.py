@@ -179,7 +179,8 @@ class BufferDonors:
         self.keys = keys
         self.goals = goals
         self._built: tuple[Any, Any, TrajectoryIndex | None] | None = None
-        self._read: dict[int, tuple[SwapPlan, list[torch.Tensor]]] = {}
+        # The donors' leaves for the last plan, and the tensordict that they are of.
+        self._read: tuple[SwapPlan, TensorDictBase, list[torch.Tensor]] | None = None
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
@@ -219,7 +220,7 @@ class BufferDonors:
         revision = storage_revision(self.storage)
         if self._built is None or self._built[0] != revision:
             self._built = (revision, *self._build())
-            self._read = {}
+            self._read = None
         return self._built[1], self._built[2]
 
     def _build(self) -> tuple[Any, TrajectoryIndex | None]:
@@ -293,11 +294,9 @@ class BufferDonors:
         """Applies what :meth:`draw` returned, see :func:`apply_swap`."""
         _, trajectories = self.index()
         data = self._data()
-        read = self._read.get(id(plan))
-        if read is None:
-            # Kept with the plan, so that its id is not given to another one.
-            read = plan, self._sources(data, plan, values)
-            self._read[id(plan)] = read
+        read = self._read
+        if read is None or read[0] is not plan or read[1] is not data:
+            self._read = read = plan, data, self._sources(data, plan, values)
         goals = self.goals
 
         def donor_goals(leaf: SwapLeaf) -> torch.Tensor:
@@ -311,7 +310,7 @@ class BufferDonors:
             values,
             draw,
             window=self.window,
-            sources=read[1],
+            sources=read[2],
             num_source_rows=len(self.storage) if wraps else None,
             goals=None if goals is None else donor_goals,
         )
@@ -358,8 +357,7 @@ class BufferDonors:
 
     def refresh(self) -> None:
         """Drops the index: needed only after writing to the storage's raw tensors."""
-        self._built = None
-        self._read = {}
+        self._built = self._read = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_built": None, "_read": {}}
+        return {**self.__dict__, "_built": None, "_read": None}
