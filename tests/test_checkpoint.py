@@ -222,7 +222,7 @@ class TestTrainingCheckpoint:
     def test_a_folder_is_not_a_checkpoint(self, tmp_path):
         run = Run(tmp_path / "folder", seed=1)
         Checkpoint(model=run.model).save(tmp_path / "folder")
-        with pytest.raises(ValueError, match=r"not a readable checkpoint.*no file"):
+        with pytest.raises(ValueError, match=r"not a readable checkpoint.*not a file"):
             run.checkpoint.load()
 
     def test_flipped_bytes_are_noticed(self, tmp_path):

@@ -1,4 +1,4 @@
-"""What the figures of the package share: size, colours, labels, legend."""
+"""Sizes, colours, labels and legends of the package's figures."""
 
 from __future__ import annotations
 

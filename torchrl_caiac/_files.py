@@ -59,11 +59,10 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def remove_leftovers(path: str | os.PathLike[str]) -> None:
-    """Removes what interrupted calls of :func:`whole_file` have left next to a file.
+    """Removes the partial files of interrupted calls of :func:`whole_file`.
 
-    That is their partial files, and the temporary files and folders that others made
-    with the name of a partial file and a suffix. No other process may be writing the
-    file.
+    Temporary files and folders whose names begin with that of a partial file, which
+    other libraries create, are removed too. No other process may be writing the file.
 
     Args:
         path (path): the file.
@@ -202,7 +201,7 @@ def claim_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         raise RuntimeError(
-            f"another process works in {folder}: wait for it, end it, or give another "
+            f"another process is using {folder}: wait for it, stop it, or give another "
             "folder"
         ) from None
     try:

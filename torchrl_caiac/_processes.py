@@ -25,7 +25,7 @@ __all__ = [
 _POSITION = "TQDM_POSITION"
 # Libraries read these when they are loaded, so they are set before a process starts.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# What `setup` made in this process, or the error that it raised.
+# The result of ``setup`` in this process, or the error that it raised.
 _worker: tuple[Any, ...] = ()
 _setup_error: Exception | None = None
 
@@ -70,10 +70,10 @@ def run_in_processes(
     """Runs jobs in separate processes, in which torch has one thread.
 
     Jobs start in order; the next one starts when one has finished. If a job raises,
-    jobs that have not started are dropped, and the error is raised when the running
-    ones have ended, with the traceback of the process as its cause. The processes end
-    with this one, however it ends. They are started by ``spawn``, so a script needs the
-    usual ``if __name__ == "__main__":``.
+    jobs that have not started are cancelled, and the error is raised after the running
+    jobs have ended, with the traceback of the worker process as its cause. The worker
+    processes exit when this process exits, for whatever reason. They are started by
+    ``spawn``, so a script needs the usual ``if __name__ == "__main__":``.
 
     Args:
         function (callable): runs one job; picklable, as are its results.
@@ -82,9 +82,9 @@ def run_in_processes(
     Keyword Args:
         processes (int): the number of processes; with 0 the jobs run in this process,
             one after another. Defaults to 2.
-        setup (callable, optional): called once in each process. ``function`` gets its
-            result as the first argument; it is closed at the end if it has ``close``.
-            Without jobs it is not called.
+        setup (callable, optional): called once in each process. The result is the first
+            argument of ``function``; it is closed at the end if it has a ``close``
+            method. Not called without jobs.
 
     Yields:
         tuple[int, Any]: the number of a finished job and its result, in the order in
@@ -92,8 +92,8 @@ def run_in_processes(
 
     Raises:
         ValueError: ``processes`` is negative.
-        RuntimeError: a process ended in the middle of a job, for lack of memory for
-            example; or an error that cannot be pickled, described with its traceback.
+        RuntimeError: a process ended in the middle of a job, for example for lack of
+            memory; or an error that cannot be pickled, described with its traceback.
         Exception: whatever a job or ``setup`` raised.
 
     Examples:
@@ -119,8 +119,8 @@ def run_in_processes(
     running: dict[Any, int] = {}
 
     def start(count: int) -> None:
-        # Never more than there are processes: the pool cannot take back a job that it
-        # has queued for the next free process.
+        # Never more jobs than processes: the pool cannot cancel a job that it has
+        # queued for the next free process.
         with _one_thread_in_new_processes():
             for number, job in islice(waiting, count):
                 running[pool.submit(_run_job, function, job)] = number
@@ -172,7 +172,7 @@ def _one_thread_in_new_processes() -> Iterator[None]:
 
 
 def _run_job(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
-    # Before every job: the one before may have raised it, as TorchRL's environments do.
+    # Before every job: the previous one may have raised it, as TorchRL's envs do.
     torch.set_num_threads(1)
     try:
         if _setup_error is not None:
@@ -212,10 +212,10 @@ def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:
 
 
 def _end_with_parent() -> None:
-    """Lets this process end as soon as the one that started it has ended.
+    """Makes this process exit as soon as its parent process has ended.
 
-    Otherwise a process whose parent was killed would wait for work forever, or continue
-    to write while the parent's successor does.
+    Otherwise a process whose parent was killed would wait for jobs forever, or write to
+    the same files as the next run.
     """
     parent = multiprocessing.parent_process()
     if parent is None:

@@ -21,8 +21,8 @@ def draw_numbers(
 ) -> torch.Tensor:
     """Draws random numbers for one device with a generator of any device.
 
-    A generator draws on its own device, so a generator of the CPU gives the same
-    numbers on all devices. They are copied without synchronising an accelerator.
+    A generator draws on its own device, so a CPU generator returns the same numbers for
+    all devices. They are copied without synchronising an accelerator.
 
     Args:
         kind (callable): the random function, such as :func:`torch.rand`.

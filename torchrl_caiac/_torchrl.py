@@ -1,8 +1,8 @@
-"""Every private name of torch, torchrl and tensordict that this package touches.
+"""All private names of torch, torchrl and tensordict that this package uses.
 
 They have no public counterpart in torch 2.14, torchrl 0.14 and tensordict 0.14. After
 an update of one of them, run ``tests/test_torchrl.py``: it tests each function here,
-and that no other module touches such a name.
+and that no other module uses such a name.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ __all__ = [
 
 
 def storage_data(storage: Any, what: str = "the storage") -> TensorDictBase:
-    """The tensordict of a storage, all of its capacity, without a copy.
+    """Returns the tensordict of a storage at its full capacity, without copying it.
 
     ``storage[:]`` is public, but raises for some index types and copies for others.
 
     Args:
         storage (TensorStorage): the storage.
-        what (str): how errors call it.
+        what (str): the storage's name in error messages.
 
     Returns:
         TensorDictBase: the storage's own tensordict.
 
     Raises:
-        TypeError: it is no :class:`~torchrl.data.TensorStorage` of tensordicts.
+        TypeError: it is not a :class:`~torchrl.data.TensorStorage` of tensordicts.
         ValueError: it is empty.
 
     Examples:
@@ -85,7 +85,7 @@ def storage_data(storage: Any, what: str = "the storage") -> TensorDictBase:
 
 
 def storage_revision(storage: TensorStorage) -> tuple[Any, ...]:
-    """A value that changes with every write through the storage."""
+    """Returns a value that changes with every write through the storage."""
     return (
         int(storage._mutation_revision),
         len(storage),
@@ -94,28 +94,28 @@ def storage_revision(storage: TensorStorage) -> tuple[Any, ...]:
 
 
 def add_revision(storage: TensorStorage) -> None:
-    """Tells a storage that its tensors were written to directly."""
+    """Notifies a storage that its tensors were written to directly."""
     storage._bump_mutation_revision()
 
 
 def forget_leaves(storage: TensorStorage) -> None:
-    """Tells a storage that leaves were added: it caches their names for writing."""
+    """Notifies a storage, which caches the names of its leaves, of added leaves."""
     storage._storage_keys = None
     add_revision(storage)
 
 
 def last_written(source: ReplayBuffer | TensorStorage) -> int | None:
-    """The row that was written last.
+    """Returns the row that was written last.
 
-    A buffer that was loaded from disk knows it from its writer's cursor alone, so pass
-    the buffer where there is one.
+    In a buffer that was loaded from disk, only the cursor of the writer records this
+    row, so pass the buffer if there is one.
 
     Args:
         source (ReplayBuffer or TensorStorage): the buffer, or its storage.
 
     Returns:
-        int, optional: the row; ``None`` where neither the storage nor the writer
-        knows it, as for a buffer over a finished dataset.
+        int, optional: the row; ``None`` if neither the storage nor the writer records
+        it, as in a buffer over an existing dataset.
 
     Examples:
         >>> import torch
@@ -139,7 +139,7 @@ def last_written(source: ReplayBuffer | TensorStorage) -> int | None:
 
 
 def drop_prefetched(rb: ReplayBuffer) -> None:
-    """Drops batches that a buffer has sampled ahead."""
+    """Discards the batches that a buffer has prefetched."""
     with rb._futures_lock:
         rb._clear_prefetch_queue_locked()
 
@@ -148,22 +148,22 @@ def drop_prefetched(rb: ReplayBuffer) -> None:
 
 
 def file_name(key: str) -> str:
-    """The file name, without suffix, that a memory-mapped tensordict gives an entry."""
+    """Returns the file name, without suffix, of an entry in a memory-mapped folder."""
     name: str = _encode_key_for_filesystem(key)
     return name
 
 
 def memmap_folder(td: TensorDictBase) -> str | None:
-    """The folder of a memory-mapped tensordict, ``None`` where it has none."""
+    """Returns the folder of a memory-mapped tensordict, ``None`` if it has none."""
     prefix = getattr(td, "_memmap_prefix", None)
     return None if prefix is None else str(prefix)
 
 
 def mark_memmap(td: TensorDictBase) -> None:
-    """Tells a loaded tensordict, and those below it, that they are memory-mapped.
+    """Flags a loaded tensordict, and those nested in it, as memory-mapped.
 
-    ``load_memmap`` does not. ``memmap_`` would, and write the folder's ``meta.json``
-    again while other processes may read it.
+    ``load_memmap`` does not set this flag. ``memmap_`` does, but rewrites the folder's
+    ``meta.json``, which other processes may be reading.
     """
     nodes = (v for v in td.values(True) if isinstance(v, TensorDictBase))
     for node in (td, *nodes):
@@ -171,7 +171,7 @@ def mark_memmap(td: TensorDictBase) -> None:
 
 
 def known_to_be_memmap(td: TensorDictBase) -> bool:
-    """Whether a tensordict is memory-mapped; one that was loaded is marked so first."""
+    """Returns whether a tensordict is memory-mapped, after flagging a loaded one."""
     if not td.is_memmap() and memmap_folder(td) is not None:
         leaves = td.values(include_nested=True, leaves_only=True)
         if all(isinstance(leaf, MemoryMappedTensor) for leaf in leaves):
@@ -180,9 +180,9 @@ def known_to_be_memmap(td: TensorDictBase) -> bool:
 
 
 def drop_memmap_leaf(td: TensorDictBase, key: NestedKey) -> None:
-    """Takes a leaf out of a memory-mapped tensordict, not out of its folder.
+    """Removes a leaf from a memory-mapped tensordict, but not from its folder.
 
-    ``del_`` needs an unlocked tensordict, and an unlocked one is memory-mapped no more.
+    ``del_`` needs an unlocked tensordict, and unlocking clears the memory-mapped flag.
     """
     parents, name = ((), key) if isinstance(key, str) else (key[:-1], key[-1])
     node = td.get(parents) if parents else td
@@ -197,19 +197,19 @@ def drop_memmap_leaf(td: TensorDictBase, key: NestedKey) -> None:
 def reduce_loss(
     loss_module: LossModule, loss: Tensor, *args: Any, **kwargs: Any
 ) -> Tensor:
-    """Reduces a loss as the module's ``reduction`` and masks say."""
+    """Reduces a loss according to the module's ``reduction`` and masks."""
     reduced: Tensor = loss_module._reduce_loss(loss, *args, **kwargs)
     return reduced
 
 
 def priority_weight(loss_module: LossModule, td: TensorDictBase) -> Tensor | None:
-    """The importance weights of a batch, ``None`` where it has none."""
+    """Returns the importance weights of a batch, ``None`` if it has none."""
     weight: Tensor | None = loss_module._maybe_get_priority_weight(td)
     return weight
 
 
 def loss_masks(loss_module: LossModule) -> list[NestedKey]:
-    """The keys of the masks that a loss module honours."""
+    """Returns the keys of the masks that a loss module applies."""
     return list(loss_module._loss_mask_keys())
 
 
@@ -224,9 +224,9 @@ def vmap_loss(*args: Any, **kwargs: Any) -> Any:
 def linear_pointwise(
     value: Tensor, weight: Tensor, bias: Tensor | None, relu: bool
 ) -> Tensor:
-    """OneDNN's linear layer ``[B, I]`` to ``[B, O]``, in float32 on a CPU.
+    """Applies oneDNN's linear layer, ``[B, I]`` to ``[B, O]``, in float32 on a CPU.
 
-    It is what ``torch.compile`` makes of ``F.linear``.
+    ``torch.compile`` replaces ``F.linear`` by the same operator.
     """
     after = "relu" if relu else "none"
     product: Tensor = torch.ops.mkldnn._linear_pointwise(
@@ -236,6 +236,6 @@ def linear_pointwise(
 
 
 def packed_weight(weight: Tensor) -> Tensor:
-    """A weight ``[O, I]`` in the order that oneDNN reads fastest, for inference."""
+    """Returns a weight ``[O, I]`` in oneDNN's fastest layout, for inference."""
     packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight)
     return packed

@@ -29,7 +29,7 @@ class TrainingCheckpoint:
     (:class:`~torchrl.checkpoint.Checkpoint`) in the archive format.
 
     - A file is written atomically: an interrupted write leaves the old file as it was.
-    - A file is refused as a whole: when :meth:`load` raises, no part has changed.
+    - Loading is all or nothing: if :meth:`load` raises, no part has changed.
     - Loading executes no code from the file: only tensors and plain containers are
       read.
 
@@ -40,7 +40,7 @@ class TrainingCheckpoint:
 
     Keyword Args:
         settings (Mapping, optional): what the run depends on, JSON-compatible. A file
-            with other settings is refused.
+            with other settings is rejected.
         rng (bool): whether to save the global random number generators too. Defaults
             to ``True``.
         **parts (Any): objects with ``state_dict`` and ``load_state_dict``: models,
@@ -91,10 +91,10 @@ class TrainingCheckpoint:
     def load(self, *, max_step: int | None = None) -> int:
         """Restores all parts if the file exists.
 
-        It also removes what interrupted writes of the file have left.
+        It also removes the partial files of interrupted writes.
 
         Keyword Args:
-            max_step (int, optional): the number of steps that are requested in total.
+            max_step (int, optional): the requested total number of steps.
 
         Returns:
             int: the number of steps taken, 0 if there is no file.
@@ -131,9 +131,9 @@ class TrainingCheckpoint:
         return step
 
     def _read_manifest(self) -> tuple[int, dict[str, Any]]:
-        """The steps and the settings of the file, once its parts are the expected."""
+        """Returns the steps and the settings of the file, after checking its parts."""
         if not self.path.is_file():
-            raise ValueError("it is no file")
+            raise ValueError("it is not a file")
         manifest = Checkpoint.manifest(self.path)
         metadata, parts = manifest["metadata"], sorted(manifest["components"])
         if metadata.get("content") != _CONTENT:

@@ -297,7 +297,7 @@ class EntityLayout:
         return {name: x.shape[-1] for name, x in read_entities(self, td).items()}
 
     def slices(self, td: TensorDictBase | None = None) -> dict[str, slice]:
-        """Returns the place of each entity in the last dimension of :meth:`read`.
+        """Returns the slice of each entity in the last dimension of :meth:`read`.
 
         Args:
             td (TensorDictBase, optional): an example, as in :meth:`widths`. Defaults
@@ -418,7 +418,7 @@ class EntityLayout:
         columns: Sequence[int],
         device: torch.device,
     ) -> torch.Tensor:
-        """Returns columns as a tensor, which the layout keeps for each device.
+        """Returns columns as a tensor, which the layout caches for each device.
 
         Indexing with a tensor on the host would synchronise a GPU in every call.
 

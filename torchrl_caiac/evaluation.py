@@ -1,4 +1,4 @@
-"""Evaluation of influence estimators by ground truth and by the swaps that follow."""
+"""Evaluation of influence estimators by ground truth and by the resulting swaps."""
 
 from __future__ import annotations
 
@@ -46,13 +46,15 @@ class Candidate(NamedTuple):
     """An estimator and a transform that reads its scores.
 
     Attributes:
-        estimator: as in :func:`~torchrl_caiac.influence.score_buffer`; its scores are
-            the influence of the action, ``[n, N]``, or graphs, ``[n, N + 1, N]``.
-        transform: a :class:`~torchrl_caiac.CAIACTransform` or a
-            :class:`~torchrl_caiac.CoDATransform` with single-row windows and donors in
-            the batch. Its threshold is θ; its keys do not matter.
-        smoothing: as in :func:`~torchrl_caiac.influence.score_buffer`.
-        fit_seconds: the time that fitting took, which is reported; NaN if unknown.
+        estimator (callable): as in :func:`~torchrl_caiac.influence.score_buffer`; its
+            scores are the influence of the action, ``[n, N]``, or graphs,
+            ``[n, N + 1, N]``.
+        transform (CounterfactualTransform): a :class:`~torchrl_caiac.CAIACTransform` or
+            a :class:`~torchrl_caiac.CoDATransform` with single-row windows and donors
+            in the batch. Its threshold is θ; its keys do not matter.
+        smoothing (int): as in :func:`~torchrl_caiac.influence.score_buffer`.
+        fit_seconds (float): the time that fitting took, which is reported; NaN if
+            unknown.
     """
 
     estimator: Callable[[TensorDictBase], torch.Tensor]
@@ -65,11 +67,11 @@ class SwapShares(NamedTuple):
     """How many swaps there are, and how many of them are infeasible.
 
     Attributes:
-        rows: the share of counterfactual rows in which an entity is swapped.
-        infeasible: the share of the swaps of each entity in which the action influences
-            it in its own row or in the donor's; float64 ``[N]``, NaN for an entity that
-            is never swapped.
-        infeasible_total: the same share over all entities.
+        rows (float): the share of counterfactual rows in which an entity is swapped.
+        infeasible (torch.Tensor): the share of the swaps of each entity in which the
+            action influences it in its own row or in the donor's; float64 ``[N]``, NaN
+            for an entity that is never swapped.
+        infeasible_total (float): the same share over all entities.
     """
 
     rows: float
@@ -89,7 +91,7 @@ def swap_shares(
     """Compares the swaps of a transform with the ground truth.
 
     A swap is infeasible if, by the ground truth, the action influences the swapped
-    entity: its motion then belongs to the action, which is not swapped.
+    entity: the action then causes its motion, and is not swapped.
 
     Args:
         transform (CounterfactualTransform): a transform with single-row windows and
@@ -267,12 +269,12 @@ def compare_influence(
 
 
 def _cpu_seconds() -> float:
-    """The processor time of this process and of its children that have ended."""
+    """Returns the processor time of this process and of its finished children."""
     return time.process_time() + sum(os.times()[2:4])
 
 
 def _density(scores: torch.Tensor, fixed: torch.Tensor, threshold: float) -> float:
-    """The share of scored links above the threshold."""
+    """Returns the share of scored links above the threshold."""
     if scores.ndim == 2:  # without fixed entities, which the action always influences
         scored = (~fixed).expand_as(scores)
     else:  # without the links from an entity to itself

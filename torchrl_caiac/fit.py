@@ -24,7 +24,7 @@ __all__ = ["fit_world_model"]
 
 _LOGGER = logging.getLogger("torchrl_caiac.fit")
 _CHUNK = 65_536  # rows read from the data at once
-_EVAL_ROWS = 4_096  # rows that pass the network at once in validation
+_EVAL_ROWS = 4_096  # rows in one forward pass in validation
 
 
 def fit_world_model(
@@ -49,7 +49,7 @@ def fit_world_model(
 
     It minimises the loss of :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` with
     Adam, on batches drawn with replacement. Whole trajectories are held out for
-    validation. The model ends in evaluation mode, with the weights and statistics of
+    validation. The model is left in evaluation mode, with the weights and statistics of
     the step with the lowest negative log likelihood on the validation data. The scale
     of the targets comes from the training trajectories, unless the model has one
     already.
@@ -166,7 +166,7 @@ def fit_world_model(
                 "max_validation_rows": max_validation_rows,
                 "seed": seed,
             },
-            rng=False,  # the batches come from a generator of their own
+            rng=False,  # the batches have their own generator
             model=model,
             optimizer=fit.optimizer,
             fit=fit,
@@ -282,7 +282,7 @@ class _Rows:
     def _columns(
         self, state: torch.Tensor, action: torch.Tensor, after: torch.Tensor
     ) -> torch.Tensor:
-        # The change is taken before the cast: float64 data keep their small changes.
+        # The change is computed before the cast, to keep small changes of float64 data.
         state, action, after = state.cpu(), action.cpu(), after.cpu()
         index = self.model.index.cpu()
         raw = after[:, index]

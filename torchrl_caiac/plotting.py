@@ -100,8 +100,8 @@ def plot_influence(
 ) -> Figure:
     """Plots the influence of the action on each entity along a demonstration (Fig. 6).
 
-    An entity gets a colour if its score exceeds the threshold in some row, or if the
-    ground truth has contact with it in some row. All others are grey. Rows with contact
+    An entity gets a colour if its score exceeds the threshold in some row, or if it is
+    in contact in some row of the ground truth. All others are grey. Rows with contact
     are shaded in the entity's colour, and shown as bars below the curves.
 
     Args:
@@ -417,7 +417,7 @@ def plot_success(
         axes.errorbar(
             centre,
             means,
-            # Rounding may leave -1e-17, which errorbar refuses.
+            # Rounding may leave -1e-17, which errorbar rejects.
             yerr=np.maximum([low, high], 0),
             fmt="none",
             ecolor="#222222",
@@ -531,8 +531,8 @@ def plot_frames(
             ``None``: no titles.
 
     Keyword Args:
-        columns (int, optional): the number of frames in a line. Defaults to ``None``:
-            all in one line.
+        columns (int, optional): the number of frames in a row. Defaults to ``None``:
+            all in one row.
         title (str): the title of the figure. Defaults to ``""``.
 
     Returns:

@@ -62,28 +62,31 @@ class TrajectoryIndex(NamedTuple):
         return self.oldest > 0 and bool(self.left[self.length - 1] > 0)
 
     def position(self, rows: torch.Tensor) -> torch.Tensor:
-        """The positions of rows ``[*]``, int64 ``[*]``."""
+        """Returns the positions of rows ``[*]``, int64 ``[*]``."""
         return (rows - self.oldest) % self.length
 
     def rows(self, position: torch.Tensor) -> torch.Tensor:
-        """The rows at positions ``[*]``, int64 ``[*]``."""
+        """Returns the rows at positions ``[*]``, int64 ``[*]``."""
         return (position + self.oldest) % self.length
 
     def remaining(self, rows: torch.Tensor) -> torch.Tensor:
-        """The number of rows of the same trajectory after each row, int64 ``[*]``."""
+        """Returns the number of later rows in each row's trajectory, int64 ``[*]``."""
         found = self.left.index_select(0, rows.to(self.device).reshape(-1))
         return found.view(rows.shape).long()
 
     def is_last(self, rows: torch.Tensor) -> torch.Tensor:
-        """Whether rows ``[*]`` are the last of their trajectories, bool ``[*]``."""
+        """Returns whether rows ``[*]`` are the last of a trajectory, bool ``[*]``."""
         return self.remaining(rows) == 0
 
     def later(self, rows: torch.Tensor, steps: torch.Tensor | int) -> torch.Tensor:
-        """The rows some steps later, at most :meth:`remaining`, int64 ``[*]``."""
+        """Returns the rows that are ``steps`` later, int64 ``[*]``.
+
+        The number of steps must be at most :meth:`remaining`.
+        """
         return (rows + steps) % self.length
 
     def numbers(self) -> torch.Tensor:
-        """The trajectory of each row, counted from 0 by time, int64 ``[T]``."""
+        """Returns the trajectory of each row, 0, 1, ... by time, int64 ``[T]``."""
         counts = torch.arange(len(self.ends), device=self.device)
         return counts.repeat_interleave(self.lengths).roll(self.oldest)
 
@@ -170,7 +173,7 @@ def trajectory_index(
 
 
 class TrajectoryCache:
-    """Keeps the index of a storage until the storage is written to.
+    """Caches the index of a storage until the storage is written to.
 
     Keyword Args:
         trajectory_key (NestedKey, optional): see :func:`trajectory_index`.
@@ -231,8 +234,8 @@ def _leaves(
     """Returns the ids and the end flags ``[T]``, ``None`` if unused or missing."""
     if trajectory_key is None and done_key is None:
         raise ValueError(
-            "trajectory_key and done_key are both None: one of them must tell where "
-            "trajectories end"
+            "trajectory_key and done_key are both None: give at least one of them, "
+            "since it marks where trajectories end"
         )
     ids = done = None
     if trajectory_key is not None:

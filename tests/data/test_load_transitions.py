@@ -141,7 +141,9 @@ def test_nothing_is_unpickled(below, tmp_path):
     data, ran = rows(), tmp_path / "ran"
     data.set_non_tensor((*below, "note"), Payload(ran))
     data.memmap(tmp_path / "data")
-    with pytest.raises(ValueError, match=r"NonTensorData in 'note', expected tensors"):
+    with pytest.raises(
+        ValueError, match=r"NonTensorData in 'note', expected only tensors"
+    ):
         load_transitions(tmp_path / "data")
     assert not ran.exists()
     # The payload works: tensordict runs it if it is allowed to.

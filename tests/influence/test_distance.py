@@ -84,12 +84,12 @@ def test_scores_the_state_after_the_last_row() -> None:
         ({"positions": {**PLACES, "box": [8]}}, "expected the same number"),
         ({"positions": dict.fromkeys(PLACES, ())}, "at least 1, for all"),
         ({"positions": {**PLACES, "box": [8, 4]}}, r"'box' the columns \[4\], which"),
-        ({"agent": "pot"}, "agent is 'pot', which is no entity"),
+        ({"agent": "pot"}, "agent is 'pot', which is not an entity"),
         ({"distance": 0.0}, "distance must be positive and finite, got 0.0"),
         ({"distance": math.nan}, "distance must be positive"),
         (
             {"layout": EntityLayout(LAYOUT.columns)},
-            r"0 fixed entities \[\]: name the one that the action moves",
+            r"0 fixed entities \[\]: pass the one that the action moves",
         ),
     ],
 )

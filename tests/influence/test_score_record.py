@@ -102,8 +102,8 @@ def test_modes_of_cai_are_never_mixed():
     [
         ('{"format": "torchrl_cai', "truncated or damaged"),
         ("", "truncated or damaged"),
-        ('{"something": 1}', "no score file"),
-        ("[1]", "no score file"),
+        ('{"something": 1}', "not a score file"),
+        ("[1]", "not a score file"),
         ('{"format": "torchrl_caiac.scores", "version": 99}', "version 99"),
         ('{"format": "torchrl_caiac.scores", "version": 1}', "incomplete"),
     ],

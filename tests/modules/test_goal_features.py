@@ -167,7 +167,7 @@ def test_nested_keys_and_dispatch():
     [
         (EntityLayout({"arm": [0]}), {}, "flat layout"),
         (EntityLayout.from_keys({"arm": "arm"}), {}, "flat layout"),
-        (push(), {"reference": "hand"}, "'hand'.*no entity"),
+        (push(), {"reference": "hand"}, "'hand'.*not an entity"),
         (push(), {"reference": "gripper", "relative": False}, "relative features only"),
         (push(), {"floor": 0.0}, "floor"),
         (push(), {"floor": float("nan")}, "floor"),

@@ -241,7 +241,7 @@ def test_config_copies_and_pickles(layout: EntityLayout) -> None:
         ({"dropout": 1.0}, r"dropout must be in \[0, 1\), got 1.0"),
         ({"out_keys": ["a", "b"]}, "out_keys must be one key"),
         ({"target": "next"}, "'change' or 'absolute'"),
-        ({"predict": {"pot": [1]}}, "no entities of this layout"),
+        ({"predict": {"pot": [1]}}, "not entities of this layout"),
     ],
 )
 def test_wrong_arguments(kwargs: dict[str, Any], message: str) -> None:

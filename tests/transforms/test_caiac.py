@@ -531,7 +531,7 @@ def test_reward_errors() -> None:
         CAIACTransform(FLAT, reward_fn=lambda a, d: a, keys=TransformKeys(reward="r"))(
             td
         )
-    with pytest.raises(TypeError, match="reward_fn is a function"):
+    with pytest.raises(TypeError, match="reward_fn must be a function"):
         CAIACTransform(FLAT, reward_fn=1.0)
 
 
@@ -655,7 +655,7 @@ def test_goals_need_a_donor_buffer_and_the_same_window() -> None:
         CAIACTransform(FLAT, window=2, goals=goals)
     with pytest.raises(ValueError, match="goals has window 2"):
         CAIACTransform(FLAT, donors=small(), goals=goals)
-    with pytest.raises(TypeError, match="goals is a WindowGoal"):
+    with pytest.raises(TypeError, match="goals must be a WindowGoal"):
         CAIACTransform(FLAT, donors=small(), goals="last")
 
 
@@ -670,7 +670,7 @@ def test_donor_buffer_errors() -> None:
     good = small().storage[:]
     with pytest.raises(ValueError, match="donor buffer is empty"):
         CAIACTransform(FLAT, donors=ReplayBuffer(storage=LazyTensorStorage(3)))(td)
-    with pytest.raises(TypeError, match="donors is a ReplayBuffer"):
+    with pytest.raises(TypeError, match="donors must be a ReplayBuffer"):
         CAIACTransform(FLAT, donors=good)
     with pytest.raises(KeyError, match="donor buffer has no scores"):
         transform(good.exclude("caiac"))(td)
@@ -732,7 +732,7 @@ def test_donor_buffer_errors() -> None:
 def test_arguments_out_of_range(name: str, value: object, error: type) -> None:
     with pytest.raises(error, match=name):
         CAIACTransform(FLAT, **{name: value})
-    with pytest.raises(TypeError, match="layout is an EntityLayout"):
+    with pytest.raises(TypeError, match="layout must be an EntityLayout"):
         CAIACTransform({"arm": [0]})
 
 
@@ -787,7 +787,7 @@ def test_layout_that_does_not_fit() -> None:
 def test_windows_that_do_not_fit() -> None:
     rb = small(window=2, batch=4)
     td = rb.sample()
-    with pytest.raises(ValueError, match="8 rows, which windows of 3 do not divide"):
+    with pytest.raises(ValueError, match="8 rows, not a multiple of the window 3"):
         CAIACTransform(FLAT, window=3)(td)
     with pytest.raises(ValueError, match="window 0 of 4 rows crosses"):
         CAIACTransform(FLAT, window=4)(rb.storage[8:16])

@@ -215,7 +215,7 @@ def test_late_errors_of_scores_and_windows() -> None:
         transform(unscored)
     transform = CAIACTransform(FLAT, window=4)
     transform(rows(FLAT)[8:16])
-    with pytest.raises(ValueError, match=r"\['the windows'\] made no sense"):
+    with pytest.raises(ValueError, match=r"\['the windows'\] were invalid"):
         transform(rows(FLAT)[:8])
 
 

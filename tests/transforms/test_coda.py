@@ -439,7 +439,7 @@ def test_graphs_of_the_wrong_shape() -> None:
     for wrong in (graph[:, :N], graph.mT, graph[:, N], graph[..., None]):
         with pytest.raises(ValueError, match=message):
             CoDATransform(FLAT)(td.copy().set(("coda", "graph"), wrong))
-    with pytest.raises(KeyError, match=r"no graphs in.*name their key by graph_key"):
+    with pytest.raises(KeyError, match=r"no graphs in.*name their key with graph_key"):
         CoDATransform(FLAT)(td.exclude(("coda", "graph")))
     donors = small()
     transform = CoDATransform(FLAT, donors=donors, graph_key="other")
@@ -469,13 +469,13 @@ def test_graphs_that_are_not_finite() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
-        ({"threshold": -0.1}, ValueError, "threshold is finite, at least 0"),
-        ({"counterfactual_ratio": 2}, ValueError, "counterfactual_ratio is in"),
-        ({"swap_prob": "1"}, TypeError, "swap_prob is a number"),
-        ({"window": 0}, ValueError, "window is at least 1 row"),
-        ({"donors": [1]}, TypeError, "donors is a ReplayBuffer"),
+        ({"threshold": -0.1}, ValueError, "threshold must be finite, at least 0"),
+        ({"counterfactual_ratio": 2}, ValueError, "counterfactual_ratio must be in"),
+        ({"swap_prob": "1"}, TypeError, "swap_prob must be a number"),
+        ({"window": 0}, ValueError, "window must be at least 1 row"),
+        ({"donors": [1]}, TypeError, "donors must be a ReplayBuffer"),
         ({"goals": WindowGoal(FLAT, 1)}, ValueError, "there is none"),
-        ({"generator": 1}, TypeError, "generator is a torch.Generator"),
+        ({"generator": 1}, TypeError, "generator must be a torch.Generator"),
     ],
 )
 def test_wrong_arguments(kwargs: Any, error: type[Exception], message: str) -> None:

@@ -38,12 +38,12 @@ _SEPARATOR = "/"
 
 
 class EpisodeSource(Protocol):
-    """Makes episodes. It is created in a worker process and may keep an environment.
+    """Generates episodes. It is created in each process and may keep an environment.
 
-    A call gets the specification of the episode and a seed that no other attempt of the
-    collection gets, and everything random must come from the two. It returns the arrays
-    of the episode, or ``None`` if the attempt failed and is to be repeated with another
-    seed. If the source has a ``close()`` method, it is called at the end.
+    A call receives the specification of the episode and a seed that is unique to the
+    attempt. All randomness must come from these two. It returns the arrays of the
+    episode, or ``None`` if the attempt failed and is to be repeated with another seed.
+    If the source has a ``close()`` method, it is called at the end.
     """
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> EpisodeArrays | None:
@@ -53,7 +53,7 @@ class EpisodeSource(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class CollectionReport:
-    """What a collection did.
+    """The result of a collection.
 
     Attributes:
         files (tuple of Path): the files of the episodes, in the order of the
@@ -113,7 +113,7 @@ def collect_episodes(
         CollectionReport: the files and the numbers of attempts.
 
     Raises:
-        ValueError: ``folder`` has another collection, or an unreadable file.
+        ValueError: ``folder`` contains another collection, or an unreadable file.
         RuntimeError: all attempts for an episode failed, or a worker process ended.
         Exception: whatever a source raised, with the traceback of the worker. Finished
             episodes are kept.
@@ -248,8 +248,8 @@ def record_episode(
 
     Keyword Args:
         max_steps (int): the number of steps after which the episode is truncated.
-        stop (callable, optional): gets the info of each step; if it returns ``True``,
-            the episode is truncated there.
+        stop (callable, optional): called with the info of each step; if it returns
+            ``True``, the episode is truncated there.
         state (callable, optional): returns what to record of the simulator with every
             observation.
 
@@ -331,7 +331,7 @@ def _collect_episode(
 
 
 def _claim_folder(root: Path, seed: int, specs: Sequence[Mapping[str, Any]]) -> None:
-    """Writes which collection the folder is for, or checks that it is for this one."""
+    """Records the collection in its folder, or checks that the folder belongs to it."""
     text = json.dumps([dict(spec) for spec in specs], sort_keys=True)
     manifest = {
         "seed": seed,

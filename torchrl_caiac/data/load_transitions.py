@@ -29,7 +29,7 @@ def load_transitions(
 
     ``TensorDict.load_memmap`` fills the missing part of a truncated file with zeros, in
     the data and on disk. This function checks the size of every file first. The
-    tensordict it returns is marked as memory-mapped, so that leaves can be added to it.
+    returned tensordict is flagged as memory-mapped, so that leaves can be added to it.
 
     Args:
         path (str or Path): the folder, as written by
@@ -85,7 +85,7 @@ def load_transitions(
 
 
 def _check_folder(folder: Path, root: Path) -> list[int]:
-    """Checks that a folder has tensors alone, each complete; returns its batch size."""
+    """Checks that a folder contains only complete tensors; returns its batch size."""
     meta = folder / "meta.json"
     if not meta.exists():
         raise ValueError(
@@ -112,7 +112,7 @@ def _check_folder(folder: Path, root: Path) -> list[int]:
         elif entry.get("type") is not None:
             # Its content may be a pickle, which could execute anything.
             raise ValueError(
-                f"{meta} has a {entry['type']} in {key!r}, expected tensors alone: "
+                f"{meta} has a {entry['type']} in {key!r}, expected only tensors: "
                 "leave it out with exclude() before the data are stored"
             )
         else:
@@ -123,7 +123,7 @@ def _check_folder(folder: Path, root: Path) -> list[int]:
 def _check_leaf(
     file: Path, entry: dict[str, Any], batch: list[int], meta: Path, key: str
 ) -> None:
-    """Checks that a leaf's file has the size that its dtype and shape say."""
+    """Checks that the size of a leaf's file matches its dtype and shape."""
     try:
         dtype = getattr(torch, str(entry["dtype"]).removeprefix("torch."))
         shape = _shape(entry["shape"])

@@ -122,7 +122,7 @@ def open_minari(
     if not data.exists():
         raise FileNotFoundError(
             f"no Minari dataset {dataset_id!r} in {data.parent}: collect it first, "
-            "pass download=True, or give its place by root= or MINARI_DATASETS_PATH"
+            "pass download=True, or give its folder with root= or MINARI_DATASETS_PATH"
         )
     return minari.MinariDataset(data)
 

@@ -41,7 +41,7 @@ def mix_trajectories(
     """Draws whole trajectories from several datasets, with given shares.
 
     For example, the Fetch-Push data of the paper are 30 % expert and 70 % random
-    episodes, of which learners get 100 %, 20 % or 10 % (A.3.1).
+    episodes, of which learners use 100 %, 20 % or 10 % (A.3.1).
 
     All trajectories that a mixture can have are put in one random order, in which every
     prefix has the given shares as exactly as whole trajectories allow. The mixture is a

@@ -52,7 +52,7 @@ def offline_buffer(
     if data.batch_dims != 1 or not len(data):
         raise ValueError(
             f"data has batch size {list(data.batch_size)}, expected [T] with at least "
-            "one row: flatten trajectories, and mark them with ids"
+            "one row: flatten trajectories, and add trajectory ids"
         )
     # Sample on the device of the data, to avoid transfers.
     device = data.device or next(iter(data.values(True, True))).device

@@ -1,4 +1,4 @@
-"""The packages that the environments need, as their datasets state them."""
+"""The packages that the environments need, as recorded in their datasets."""
 
 from __future__ import annotations
 

@@ -36,7 +36,8 @@ class RenderingUnavailable(RuntimeError):
 class OffscreenRenderer:
     """Renders frames of a model in an OpenGL context of its own.
 
-    Shadows and reflections are off: in software they cost ten times the rest.
+    Shadows and reflections are off: in software they take ten times as long as the
+    rest.
 
     ``mujoco.Renderer`` uses the backend that ``MUJOCO_GL`` named when mujoco was
     imported. This class looks for a backend when it is created, so nothing needs to be

@@ -82,7 +82,9 @@ class AttentionInfluence(nn.Module):
                 "score, predict at least one column of each"
             )
         if max_memory < 1:
-            raise ValueError(f"max_memory is a number of bytes, got {max_memory!r}")
+            raise ValueError(
+                f"max_memory must be a number of bytes, got {max_memory!r}"
+            )
         self.model = model
         self.action_only = bool(action_only)
         self.max_memory = int(max_memory)
@@ -121,7 +123,7 @@ class AttentionInfluence(nn.Module):
             tensordict,
             model.action_key,
             "the data lack the action",
-            "name it by action_key of the model",
+            "name it with the model's action_key",
         )
         batch = state.shape[:-1]
         state = state.reshape(-1, state.shape[-1])

@@ -71,8 +71,8 @@ class CAI(nn.Module):
     r"""Scores how much the action influences each entity, by a learned model.
 
     ``K`` actions are drawn once, uniformly from the action space (paper, A.7), and kept
-    as a buffer. The same actions serve the expectation and the mixture of eq. 3, and
-    all states.
+    as a buffer. The same actions are used for the expectation and the mixture of eq. 3,
+    and for all states.
 
     The mode ``"fast"`` is for masks at a ``threshold``. It first estimates the scores
     of each state from 16 of the actions, which are far from each other. If an estimate
@@ -80,11 +80,12 @@ class CAI(nn.Module):
     computed exactly. The other scores remain estimates of at most :math:`\log 16`.
     "Near" is the range from ``threshold / f`` to ``threshold * f``. The factor ``f``,
     from 1.5 to 16, is the smallest one with which 99.95 % of all entities are on the
-    same side of the threshold as with exact scores, on up to 4,096 states from all over
+    same side of the threshold as with exact scores, on up to 4,096 states spread over
     the data. If no factor suffices, a warning says so and all scores are exact.
     :func:`~torchrl_caiac.influence.score_buffer` takes these states from the whole
     buffer (:meth:`prepare`) and multiplies the upper end of the range by ``smoothing``,
-    since it averages scores. A call of the estimator alone takes them from its input.
+    since it averages scores. If the estimator is called directly, they are taken from
+    its input.
 
     Args:
         model (GaussianWorldModel): a fitted world model that predicts every entity.
@@ -153,12 +154,14 @@ class CAI(nn.Module):
             )
         if approximation not in ("product", "bounds"):
             raise ValueError(
-                f"approximation is 'bounds' or 'product', got {approximation!r}"
+                f"approximation must be 'bounds' or 'product', got {approximation!r}"
             )
         if max_memory < 1:
-            raise ValueError(f"max_memory is a number of bytes, got {max_memory!r}")
+            raise ValueError(
+                f"max_memory must be a number of bytes, got {max_memory!r}"
+            )
         if mode not in ("exact", "fast"):
-            raise ValueError(f"mode is 'exact' or 'fast', got {mode!r}")
+            raise ValueError(f"mode must be 'exact' or 'fast', got {mode!r}")
         if mode == "fast" and (threshold is None or not threshold > 0):
             raise ValueError(
                 "the fast mode needs the threshold that the scores will be compared "
@@ -296,7 +299,7 @@ class CAI(nn.Module):
     def _network(
         self, actions: list[int]
     ) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
-        """A function that predicts Gaussians under some of the actions."""
+        """Returns a function that predicts Gaussians under some of the actions."""
         model = self.model
         # A quarter of the memory, for the activations of two layers and the outputs of
         # both heads.
@@ -308,7 +311,7 @@ class CAI(nn.Module):
         return model.for_actions(self.actions[actions], rows=rows)
 
     def _states_at_once(self, num_actions: int) -> int:
-        """The number of states whose Gaussians fit into the memory."""
+        """Returns the number of states whose Gaussians fit into the memory."""
         most = self.max_memory // 4 // _GAUSSIAN_TENSORS
         if self.actions.device.type == "cpu":
             most = min(most, _CPU_GAUSSIAN_BYTES)
@@ -333,7 +336,7 @@ class CAI(nn.Module):
     def _any_within(
         self, scores: torch.Tensor, near: tuple[float, float]
     ) -> torch.Tensor:
-        """Whether an entity that is not fixed has a score in the range, ``[n]``."""
+        """Returns whether any entity that is not fixed is within the range, ``[n]``."""
         names, fixed = self.layout.names, self.layout.fixed
         free = [i for i, name in enumerate(names) if name not in fixed]
         return ((scores > near[0]) & (scores < near[1]))[:, free].any(-1)
@@ -380,7 +383,7 @@ class CAI(nn.Module):
 
 
 def _spread(actions: torch.Tensor, count: int) -> list[int]:
-    """Some of the actions ``[K, A]``, each as far as possible from those before it."""
+    """Returns some of the actions ``[K, A]``, each far from the previous ones."""
     unit = actions / actions.std(0).clamp_min(1e-9)
     distance = (unit - unit.mean(0)).norm(dim=-1)
     chosen = [int(distance.argmax())]
@@ -396,8 +399,8 @@ def _bounds(spec: Bounded | None, size: int) -> tuple[torch.Tensor, torch.Tensor
         return -torch.ones(size), torch.ones(size)
     if not isinstance(spec, Bounded):
         raise TypeError(
-            f"action_spec is a torchrl Bounded spec, got {type(spec).__name__}: only a "
-            "bounded action space has a uniform distribution"
+            f"action_spec must be a torchrl Bounded spec, got {type(spec).__name__}: "
+            "only a bounded action space has a uniform distribution"
         )
     if tuple(spec.shape) != (size,):
         raise ValueError(

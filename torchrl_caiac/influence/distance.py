@@ -91,12 +91,12 @@ class DistanceInfluence(nn.Module):
             if len(layout.fixed) != 1:
                 raise ValueError(
                     f"the layout has {len(layout.fixed)} fixed entities "
-                    f"{list(layout.fixed)}: name the one that the action moves by agent"
+                    f"{list(layout.fixed)}: pass the one that the action moves as agent"
                 )
             agent = layout.fixed[0]
         if agent not in layout.names:
             raise ValueError(
-                f"agent is {agent!r}, which is no entity: the layout has "
+                f"agent is {agent!r}, which is not an entity: the layout has "
                 f"{list(layout.names)}"
             )
         if not (distance > 0 and math.isfinite(distance)):
@@ -134,7 +134,7 @@ class DistanceInfluence(nn.Module):
         return torch.cat([near, near[..., agent : agent + 1, :]], -2).float()
 
     def _positions(self, td: TensorDictBase) -> torch.Tensor:
-        """The positions ``[*B, N, coordinates]``."""
+        """Returns the positions ``[*B, N, coordinates]``."""
         state = self.layout.read(td)
         slices = self.layout.slices(td)
         index = []

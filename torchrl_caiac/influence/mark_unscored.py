@@ -18,9 +18,9 @@ def set_unscored(
 ) -> TensorDictBase:
     """Sets the scores of transitions to NaN, which means not scored.
 
-    A score is valid for one place in one trajectory. Transitions that are written into
-    a storage get NaN even if they have scores, so that an old score never passes for
-    one of the new place.
+    A score is valid for one position in one trajectory. Transitions that are written
+    into a storage get NaN even if they have scores, so that an old score is never used
+    at a new position.
 
     Args:
         tensordict (TensorDictBase): transitions ``[*B]``.

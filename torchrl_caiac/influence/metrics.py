@@ -18,15 +18,15 @@ class EntityReport(TypedDict):
     """How well a score finds the influence on one entity.
 
     Attributes:
-        auc: the area under the ROC curve, see :func:`roc_auc`.
-        best_threshold: the threshold of :func:`best_threshold`.
-        best_balanced_accuracy: the balanced accuracy at that threshold.
-        true_positive_rate: the share of influenced states that score above θ; NaN
-            where no state is influenced.
-        false_positive_rate: the share of uninfluenced states that score above θ; NaN
-            where every state is influenced.
-        influenced: the share of influenced states.
-        below_threshold: the share of states that score at most θ.
+        auc (float): the area under the ROC curve, see :func:`roc_auc`.
+        best_threshold (float): the threshold of :func:`best_threshold`.
+        best_balanced_accuracy (float): the balanced accuracy at that threshold.
+        true_positive_rate (float): the share of influenced states that score above θ;
+            NaN where no state is influenced.
+        false_positive_rate (float): the share of uninfluenced states that score above
+            θ; NaN where every state is influenced.
+        influenced (float): the share of influenced states.
+        below_threshold (float): the share of states that score at most θ.
     """
 
     auc: float

@@ -97,14 +97,14 @@ def causal_action_influence(
         )
     if approximation not in ("product", "bounds"):
         raise ValueError(
-            f"approximation is 'bounds' or 'product', got {approximation!r}"
+            f"approximation must be 'bounds' or 'product', got {approximation!r}"
         )
     if not loc.is_floating_point() or loc.dtype != var.dtype:
         raise ValueError(
             f"expected one floating dtype for both, got {loc.dtype} and {var.dtype}"
         )
     if max_memory < 1:
-        raise ValueError(f"max_memory is a number of bytes, got {max_memory!r}")
+        raise ValueError(f"max_memory must be a number of bytes, got {max_memory!r}")
     check_gaussians(loc, var)
     k, d = loc.shape[-2:]
     scores = mixture_influence(
@@ -224,7 +224,7 @@ def mixture_influence(
 def _columns(
     slices: Sequence[slice], entities: Sequence[int], device: torch.device
 ) -> torch.Tensor:
-    """The columns of some entities of one width, ``[width, n]``."""
+    """Returns the columns of some entities of one width, ``[width, n]``."""
     own = [list(range(slices[i].start, slices[i].stop)) for i in entities]
     return torch.tensor(own, device=device).T
 
@@ -233,7 +233,7 @@ def _columns(
 
 
 def _columns_first(loc: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """The input of the kernel, each ``[P, b, K]`` and contiguous."""
+    """Returns the input of the kernel, each ``[P, b, K]`` and contiguous."""
     loc, var = (x.permute(2, 0, 1).contiguous() for x in _standardized(loc, var))
     return loc, var, var.reciprocal(), var.log().mul_(0.5)
 
@@ -262,7 +262,7 @@ def _pair_sums(
     inverse: torch.Tensor,
     half_log_det: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    r"""The sums of both approximations over actions k, ``[b, K]`` for actions i.
+    r"""Sums both approximations over actions k, ``[b, K]`` for actions i.
 
     The first is over :math:`e^{-D_{KL}(p_i \| p_k)}`, the second over
     :math:`\int p_i p_k / \int p_i^2`. Both terms are 1 for k = i; the first is at most
@@ -288,10 +288,10 @@ def _pair_sums(
 def _kernel(
     width: int, device: str
 ) -> Callable[..., tuple[torch.Tensor, torch.Tensor]] | None:
-    """The kernel for entities of this width, ``None`` if it cannot be compiled."""
+    """Returns the kernel for entities of this width, ``None`` if compiling fails."""
     if device in _without_compiler:
         return None
-    # torch's annotations do not know isolate_recompiles yet.
+    # torch's annotations do not include isolate_recompiles yet.
     kernel = torch.compile(  # type: ignore[call-overload]
         _pair_sums, fullgraph=True, dynamic=True, isolate_recompiles=True
     )
@@ -319,7 +319,7 @@ def _kernel(
 def _stepwise(
     loc: torch.Tensor, var: torch.Tensor, approximation: Approximation, max_memory: int
 ) -> torch.Tensor:
-    """The influence ``[B]`` on one entity ``[B, K, d]``, with all pairs in memory."""
+    """Returns the influence ``[B]`` on one entity ``[B, K, d]``, from all pairs."""
     k = loc.shape[1]
     pair_bytes = max_memory // _PAIR_TENSORS
     if loc.device.type == "cpu":
@@ -337,7 +337,7 @@ def _stepwise(
 def _stepwise_rows(
     loc: torch.Tensor, var: torch.Tensor, own: int, approximation: Approximation
 ) -> torch.Tensor:
-    """Eq. 3 for some rows ``[b, K, d]``, ``own`` of the K actions ``i`` at a time."""
+    """Computes eq. 3 for rows ``[b, K, d]``, ``own`` of the actions ``i`` at a time."""
     k, d = loc.shape[-2:]
     loc, var = _standardized(loc, var)
     inverse = var.reciprocal()
@@ -398,7 +398,7 @@ def _average(
     d: int,
     approximation: Approximation,
 ) -> torch.Tensor:
-    """The mean of both approximations, from the logarithms of the sums over k."""
+    """Returns the mean of both approximations, from the log sums over k."""
     log_k = math.log(k)
     gap = 0.5 * d * (1 - math.log(2)) if approximation == "bounds" else 0.0
     upper = (log_k - log_upper).clamp_min_(0)

@@ -1,4 +1,4 @@
-"""Scores every stored state once and keeps the scores next to the data."""
+"""Scores every stored state once and stores the scores next to the data."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def score_buffer(
 
     So smoothing is a centered box filter (an even width has its longer side in the
     past). At the ends of a trajectory the mean is over the states that exist. The state
-    after the last row takes part as any other state. No window crosses from one
+    after the last row is treated like any other state. No window crosses from one
     trajectory into another. ``lookahead=0`` gives the score of the row's own state, the
     paper's :math:`\mathcal{U}_s` (section 3.3). With ``lookahead=1``, a row below the
     threshold is uninfluenced in its state and in its next state.
@@ -109,18 +109,18 @@ def score_buffer(
             the ``layout`` (:class:`EntityLayout`) that the scores follow. It gets the
             keys in its ``in_keys``, or those of the layout if it has no ``in_keys``. If
             it has a method ``prepare(states, num_states, smoothing=...)``, that is
-            called first, with up to 4,096 states from all over the buffer and the
-            number of rows.
+            called first, with up to 4,096 states spread over the buffer and the number
+            of rows.
         batch_size (int): the number of states scored at once. Defaults to 4096.
         smoothing (int): the width of the box filter in states. Defaults to 1: no
             smoothing.
 
     Keyword Args:
         key (NestedKey): the leaf to write. Defaults to ``("caiac", "score")``.
-        lookahead (int): how many later states enter the maximum of a row. Defaults to
+        lookahead (int): the number of later states in the maximum of a row. Defaults to
             1.
-        every (int): score only every this many states of a trajectory. Defaults to 1:
-            all of them.
+        every (int): score only every ``every``-th state of a trajectory. Defaults to 1:
+            all states.
         trajectory_key (NestedKey, optional): the trajectory ids, see
             :func:`~torchrl_caiac.trajectories.trajectory_index`; ``None`` to rely on
             ``done_key`` alone. Defaults to ``"episode"``.
@@ -131,7 +131,7 @@ def score_buffer(
         progress (bool): show a progress bar. Defaults to ``True``.
 
     Raises:
-        TypeError: ``rb`` is no replay buffer, its storage contains no tensordict, or
+        TypeError: ``rb`` is not a replay buffer, its storage contains no tensordict, or
             the estimator has no layout.
         ValueError: the buffer is empty or its storage has several dimensions; an
             observation or a score is not finite; the estimator's output has another
@@ -208,7 +208,7 @@ def score_buffer(
     leaf = find_leaf(data, key)
     record = None if overwrite else read_record(storage, data, key)
     if not overwrite and leaf is not None:
-        # What is beyond the written rows does not matter.
+        # Rows that have not been written do not matter.
         written = leaf[: index.length]
         if record is not None and record["state"] == "new":
             overwrite = True  # interrupted before the leaf was filled with NaN
@@ -245,7 +245,7 @@ def score_buffer(
             leaf[span] = scores.to(leaf.device)
             bar.update(len(scores))
     add_revision(storage)
-    # Batches that were sampled ahead lack the leaf, or have it unscored.
+    # Prefetched batches lack the leaf, or have it unscored.
     drop_prefetched(rb)
 
 
@@ -268,7 +268,7 @@ def _can_keep(
     key: NestedKey,
     batch_size: int,
 ) -> bool:
-    """Whether existing scores have these settings; raises if they have others."""
+    """Returns whether existing scores have these settings; raises otherwise."""
     if record is not None and record["settings"] == settings:
         return True
     # A leaf without scores may come from a transform that was there at the first write.

@@ -1,4 +1,4 @@
-"""The leaf of a storage that holds the scores."""
+"""The leaf of a storage that contains the scores."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def find_leaf(data: TensorDictBase, key: NestedKey) -> torch.Tensor | None:
 def check_leaf(
     leaf: torch.Tensor, key: NestedKey, data: TensorDictBase, layout: EntityLayout
 ) -> None:
-    """Raises if a leaf cannot hold the scores of a layout's entities.
+    """Raises if a leaf cannot contain the scores of a layout's entities.
 
     Args:
         leaf (torch.Tensor): the leaf.
@@ -94,7 +94,7 @@ def new_leaf(
 ) -> torch.Tensor:
     """Adds a score leaf in which no row is scored.
 
-    A leaf that is there is used again if its shape and dtype fit, and replaced if not.
+    An existing leaf is reused if its shape and dtype fit, and replaced otherwise.
 
     Args:
         storage (TensorStorage): the storage.
@@ -127,7 +127,7 @@ def new_leaf(
                 data.set(key, leaf)
             leaf = data.get(key)
     leaf.fill_(torch.nan)
-    # The storage filters what is written by a list of keys that it made before.
+    # The storage filters what is written by a list of keys that it created earlier.
     forget_leaves(storage)
     return leaf
 

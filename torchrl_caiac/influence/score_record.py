@@ -55,7 +55,8 @@ def read_record(
     """Returns the record of some scores.
 
     Args:
-        storage (TensorStorage): the storage; has the record of data without a folder.
+        storage (TensorStorage): the storage, which stores the record of data without a
+            folder.
         data (TensorDictBase): its rows.
         key (NestedKey): the score leaf.
 
@@ -64,7 +65,7 @@ def read_record(
         ``"scored"``), ``"settings"`` and others; ``None`` where there is no record.
 
     Raises:
-        ValueError: the file is damaged, or is no score file of this version.
+        ValueError: the file is damaged, or is not a score file of this version.
     """
     folder = _folder(data)
     if folder is None:
@@ -83,7 +84,7 @@ def read_record(
             f"the score file {file} is truncated or damaged ({error}): {remedy}"
         ) from error
     if not isinstance(record, dict) or record.get("format") != _FORMAT:
-        raise ValueError(f"{file} is no score file of torchrl_caiac: {remedy}")
+        raise ValueError(f"{file} is not a score file of torchrl_caiac: {remedy}")
     if record.get("version") != _VERSION:
         raise ValueError(
             f"the score file {file} has version {record.get('version')!r}, this "

@@ -18,7 +18,7 @@ from torchrl_caiac.trajectories import TrajectoryIndex
 __all__ = ["Scorer"]
 
 _NAMED = 8  # rows that an error names
-_SAMPLE = 4096  # states that an estimator may look at before it scores
+_SAMPLE = 4096  # states that are passed to the estimator's prepare()
 
 # Scores of the states of a block's rows, of the states after them, and which rows are
 # the last of their trajectories.
@@ -26,12 +26,12 @@ _Block = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class Scorer:
-    """Computes the scores of one chunk of rows after another.
+    """Computes the scores of a storage, one chunk of rows at a time.
 
     The estimator is called on blocks of ``batch_size`` rows that start at multiples of
     ``batch_size``. So the raw score of a state does not depend on where an interrupted
-    call resumed. A chunk is the rows of a block; it reads the blocks that its windows
-    reach.
+    call resumed. A chunk consists of the rows of one block; all blocks that its windows
+    reach are read.
 
     Args:
         data (TensorDictBase): the rows of the storage, ``[capacity]``.
@@ -46,8 +46,9 @@ class Scorer:
         every (int): the same.
 
     Attributes:
-        num_chunks: the number of chunks.
-        feature_shape: the shape of the scores of a row, ``None`` until it is known.
+        num_chunks (int): the number of chunks.
+        feature_shape (tuple of int, optional): the shape of the scores of a row,
+            ``None`` until it is known.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Scorer:
         in_keys = getattr(estimator, "in_keys", None)
         in_keys = [as_key(k) for k in in_keys] if in_keys else state_keys
         reads_state_only = set(in_keys) <= set(state_keys)
-        # Whether the state after the last row of a trajectory takes part.
+        # Whether the state after the last row of a trajectory is scored.
         self._final = reads_state_only and (smoothing > 1 or lookahead > 0)
         layout.check(data[:1], next=self._final)
         self._states = _select(data, in_keys)
@@ -169,7 +170,7 @@ class Scorer:
         return best[place[first : first + span.stop - span.start]]
 
     def _reach(self, c: int, *, ring: bool) -> tuple[torch.Tensor, int]:
-        """The rows that a chunk reads, and how many of them precede the chunk."""
+        """Returns the rows that a chunk reads, and the number of rows before it."""
         span, gap = self.span(c), self._every - 1
         before = self._past + gap
         start, stop = span.start - before, span.stop + self._future + self._lookahead
@@ -179,7 +180,7 @@ class Scorer:
         return torch.arange(max(0, start), stop), min(before, span.start)
 
     def _position(self, rows: torch.Tensor) -> torch.Tensor:
-        """How many rows of the same trajectory precede each row, int64 ``[n]``."""
+        """Counts the rows of the same trajectory before each row, int64 ``[n]``."""
         if self._every == 1:
             return torch.zeros_like(rows)  # every state is scored
         index = self._index
@@ -195,7 +196,7 @@ class Scorer:
         needed: torch.Tensor,
         what: str,
     ) -> torch.Tensor:
-        """The raw scores of some of a block's rows, NaN in the others."""
+        """Returns the raw scores of some of a block's rows, NaN in the others."""
         if bool(needed.all()):
             span = slice(int(rows[0]), int(rows[-1]) + 1)
             return self._evaluate(states[span], rows, what)
@@ -212,7 +213,7 @@ class Scorer:
         return scores
 
     def _prepare(self) -> None:
-        """Shows the estimator a sample, the same when an interrupted call resumes."""
+        """Prepares the estimator with a sample, the same after an interruption."""
         prepare = getattr(self._estimator, "prepare", None)
         if prepare is not None and not self._is_prepared:
             length = self._index.length
@@ -227,7 +228,7 @@ class Scorer:
     def _evaluate(
         self, states: TensorDictBase, rows: torch.Tensor, what: str
     ) -> torch.Tensor:
-        """The estimator's scores of states ``[n]``, checked."""
+        """Returns the estimator's scores of states ``[n]``, after checking them."""
         self._prepare()
         # A copy: the estimator may write into its input.
         states = states.clone()

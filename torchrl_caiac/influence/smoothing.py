@@ -15,8 +15,8 @@ def smooth(
     Args:
         scores (torch.Tensor): ``[S, ...]``, in the order of time.
         trajectory (torch.Tensor): the trajectory of each state, integer ``[S]``.
-        past (int): how many earlier states the window has.
-        future (int): how many later states the window has.
+        past (int): the number of earlier states in the window.
+        future (int): the number of later states in the window.
 
     Returns:
         torch.Tensor: float32 ``[S, ...]``.
@@ -47,7 +47,7 @@ def max_ahead(
     Args:
         scores (torch.Tensor): ``[S, ...]``, in the order of time.
         trajectory (torch.Tensor): the trajectory of each state, integer ``[S]``.
-        lookahead (int): how many later states take part.
+        lookahead (int): the number of later states to include.
 
     Returns:
         torch.Tensor: ``[S, ...]``.

@@ -38,12 +38,12 @@ _CHUNK = 8  # states in one job
 
 
 class InfluenceSimulator(Protocol):
-    """What :func:`true_influence` needs of an environment.
+    """The interface of environments for :func:`true_influence`.
 
     It may also have ``in_reach(state, *, horizon=1)``, which returns bool ``[N]``:
     ``False`` for an entity that no action can move. A state in which all entities that
-    are not fixed are out of reach is not simulated. The bound must be safe, since
-    influence that it misses is not noticed.
+    are not fixed are out of reach is not simulated. The bound must be conservative,
+    since influence that it misses is not detected.
     """
 
     @property
@@ -64,11 +64,11 @@ class TrueInfluence(NamedTuple):
     """The ground truth for some states.
 
     Attributes:
-        influenced: bool ``[S, N]``, in the order of the layout; fixed entities (the
-            robot) are always influenced.
-        displacement: float32 ``[S, N]``, the largest distance between the next states
-            of an entity under any two of the actions, in metres or radians; 0 in states
-            that were not simulated because of ``in_reach``.
+        influenced (torch.Tensor): bool ``[S, N]``, in the order of the layout; fixed
+            entities (the robot) are always influenced.
+        displacement (torch.Tensor): float32 ``[S, N]``, the largest distance between
+            the next states of an entity under any two of the actions, in metres or
+            radians; 0 in states that were not simulated because of ``in_reach``.
     """
 
     influenced: torch.Tensor
@@ -126,17 +126,17 @@ def true_influence(
     From each state, every one of ``num_actions`` uniform actions (the same for all
     states) is simulated without noise. An entity is influenced if two of the actions
     bring it to places more than ``threshold`` apart. This is the ground truth that
-    estimators of eq. 3 approximate. What an entity does on its own (a kettle that
-    slides on after a push) is the same under every action and does not count.
+    estimators of eq. 3 approximate. Motion that does not depend on the action (a kettle
+    that keeps sliding after a push) is the same under every action and does not count.
 
     The default of 2 mm (or mrad) separates contact from no contact. Without contact,
     entities differ by less than 1e-8 between actions. In the states of scripted
     microwave and kettle demonstrations, 146 of the 147 displacements above 1e-8 are
     above 2 mm, and every threshold from 0.3 to 4 mm gives the same masks. Smaller
-    differences have no use: the observation noise of an object is up to 0.05 mm, a task
-    tolerates 0.3, and the world models treat differences below their floor of 2 mm as
-    noise. Sixteen actions miss 3 of 27 contacts that 48 actions find in every sixth of
-    these states.
+    differences are irrelevant: the observation noise of an object is up to 0.05 mm, a
+    task tolerates 0.3, and the world models treat differences below their floor of 2 mm
+    as noise. Sixteen actions miss 3 of 27 contacts that 48 actions find in every sixth
+    of these states.
 
     Args:
         env (InfluenceSimulator or callable): a simulator, or a picklable function
@@ -285,7 +285,7 @@ def _displacements(
     free: list[int],
     horizon: int,
 ) -> NDArray[np.float64]:
-    """The displacements ``[S, N]`` of the entities in some states."""
+    """Returns the displacements ``[S, N]`` of the entities in some states."""
     in_reach = getattr(simulator, "in_reach", None)
     result = np.zeros((len(states), len(columns)))
     for values, state in zip(result, states, strict=True):
@@ -335,8 +335,8 @@ class SimulatorInfluence:
     influenced if one of the two around it is.
 
     Args:
-        factory (callable): creates the simulator, see :func:`true_influence`; its class
-            will do.
+        factory (callable): creates the simulator, such as its class; see
+            :func:`true_influence`.
 
     Keyword Args:
         state_key (NestedKey or list of NestedKey): what ``outcomes`` takes, ``[*B,
@@ -412,7 +412,7 @@ class SimulatorInfluence:
                 tensordict,
                 key,
                 "the data lack the state of the simulator",
-                "name the leaf that has it by state_key",
+                "name the leaf with state_key",
             )
             for key in self.in_keys
         ]

@@ -40,7 +40,7 @@ def checked_widths(
         return own
     if widths is None:
         raise ValueError(
-            "a nested layout does not know the number of features: pass "
+            "the number of features of a nested layout is unknown: pass "
             "widths=layout.widths(td) with an example tensordict"
         )
     if set(widths) != set(layout.names):
@@ -86,7 +86,7 @@ def checked_predict(
     unknown = [name for name in predict if name not in layout.names]
     if unknown:
         raise ValueError(
-            f"predict names {unknown}, which are no entities of this layout: expected "
+            f"predict names {unknown}, which are not entities of this layout: expected "
             f"some of {list(layout.names)}"
         )
     positions: dict[str, tuple[int, ...]] = {}

@@ -267,7 +267,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
         return ((raw - loc) / scale).to(self.dtype)
 
     def physical(self, state: torch.Tensor, loc: torch.Tensor) -> torch.Tensor:
-        """Returns the next state of normalised targets, the inverse of both.
+        """Returns the next state for normalised targets, the inverse of both methods.
 
         Args:
             state (torch.Tensor): the entities' features ``[*B, W]``.
@@ -432,7 +432,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
 
     @classmethod
     def from_config(cls: type[_Model], config: Mapping[str, Any]) -> _Model:
-        """Makes an untrained model with the arguments of another.
+        """Creates an untrained model with the arguments of another.
 
         Args:
             config (Mapping): the :attr:`config` of a model of this class.
@@ -464,7 +464,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
         return cls(**kwargs)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Returns the part of ``state_dict`` that is no tensor."""
+        """Returns the part of ``state_dict`` that is not a tensor."""
         return {"config": json.dumps(self.config), "fitted": self.fitted}
 
     def set_extra_state(self, state: Any) -> None:
@@ -474,7 +474,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
     def _load_from_state_dict(
         self, state_dict: Any, prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        # Compared before any tensor is copied: a refused model stays as it was.
+        # Compared before any tensor is copied, so that an error changes nothing.
         extra = state_dict.get(f"{prefix}_extra_state")
         if extra is not None:
             found = json.loads(extra["config"])
@@ -486,7 +486,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
                     value = self.layout
                 raise ValueError(
                     f"the saved world model has another {name}, saved:\n"
-                    f"{found.get(name)}\nthis model:\n{value}\nMake the model with "
+                    f"{found.get(name)}\nthis model:\n{value}\nCreate the model with "
                     f"the saved arguments ({found['class']}.from_config)"
                 )
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -224,9 +224,9 @@ class GaussianWorldModel(EntityDynamicsModel):
             actions (torch.Tensor): the actions, ``[K, A]``.
 
         Keyword Args:
-            rows (int): the number of pairs of a state and an action that pass the
-                network at once. Defaults to ``1024``: their activations stay in the
-                cache of the processor.
+            rows (int): the number of pairs of a state and an action in one forward
+                pass. Defaults to ``1024``: their activations stay in the cache of the
+                processor.
 
         Returns:
             callable: maps states ``[B, W]`` to mean and variance, ``[B, K, P]`` each.

@@ -38,24 +38,24 @@ def read_leaves(
         >>> read_leaves(TensorDict({"a": 1}), ["a"])
         [tensor(1)]
     """
-    remedy = "write it, or name the leaf that has it"
+    remedy = "add it, or give the key of its leaf"
     return [get_leaf(tensordict, key, "the data lack", remedy) for key in keys]
 
 
 class GoalFeatures(TensorDictModuleBase):
-    """Joins a state and a goal, and adds where the objects have to go.
+    """Concatenates a state, a goal and, optionally, the differences between them.
 
     The ``F`` features are, in this order, the ``W`` columns of all entities
     (:meth:`~torchrl_caiac.EntityLayout.read`; columns that no entity owns are left
     out), the ``G`` columns of the desired goal and, if ``relative``, for each goal
     column the achieved goal minus the position of the reference (if there is one), and
-    the desired goal minus the achieved one. The relative features are computed from
-    the state after a swap. Stored ones would still describe the entity that was
-    swapped out.
+    the desired goal minus the achieved one. The relative features are computed from the
+    state after a swap. Stored relative features would still describe the entity that
+    was swapped out.
 
-    All features are normalised by fixed statistics, which :meth:`fit_statistics` takes
-    from data; until then they pass unchanged. Call it before networks are made of the
-    features: networks copy them.
+    All features are normalised by fixed statistics, which :meth:`fit_statistics`
+    computes from data; until then they are returned unchanged. Call it before networks
+    are created with this module: networks copy it.
 
     Args:
         layout (EntityLayout): a flat layout with ``goal`` and ``achieved`` columns.
@@ -197,7 +197,7 @@ class GoalFeatures(TensorDictModuleBase):
         return ((features - shift) / divisor).to(shift.dtype)
 
     def fit_statistics(self, tensordict: TensorDictBase) -> GoalFeatures:
-        """Takes the mean and the standard deviation of every feature from data.
+        """Computes the mean and the standard deviation of every feature from data.
 
         Args:
             tensordict (TensorDictBase): transitions ``[*B]`` with the goals that the
@@ -281,8 +281,8 @@ def _by_goal_column(
 def _reference_columns(layout: EntityLayout, reference: str) -> list[int]:
     if reference not in layout.names:
         raise ValueError(
-            f"reference is {reference!r}, which is no entity of this layout: expected "
-            f"one of {list(layout.names)}"
+            f"reference is {reference!r}, which is not an entity of this layout: "
+            f"expected one of {list(layout.names)}"
         )
     position = layout.columns[reference]
     columns = {}

@@ -61,9 +61,9 @@ class _CastLinear(nn.Linear):
 
 
 class _MLP(MLP):
-    """An MLP that can be called with parameters that are not its own.
+    """An MLP that can be called with external parameters.
 
-    Swapping them in and out of the modules would take a fifth of a training step.
+    Swapping parameters in and out of the modules would take a fifth of a training step.
     Stacked parameters of ``C`` networks map ``[C, *B, I]`` to ``[C, *B, O]``.
     """
 
@@ -231,8 +231,8 @@ class GoalConditionedCritic(TensorDictModuleBase):
     """An action value ``Q(s, g, a)``: features and action, then a ReLU network.
 
     Args:
-        features (GoalFeatures): the input of the network next to the action. It is
-            copied: fit its statistics first.
+        features (GoalFeatures): the input of the network in addition to the action. It
+            is copied: fit its statistics first.
         action_dim (int): the size ``A`` of the action.
         hidden_sizes (sequence of int): the widths of the hidden layers. Defaults to
             three layers of 256 (paper, A.5.2).
@@ -317,7 +317,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
 
 
 def takes_params(network: nn.Module) -> bool:
-    """Returns whether a network can be called with parameters that are not its own.
+    """Returns whether a network can be called with external parameters.
 
     Args:
         network (torch.nn.Module): a policy or an action value.

@@ -52,7 +52,7 @@ def read_leaf(tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:
         tensordict,
         key,
         "the data lack",
-        "write it, or name the leaf that has it (the *_key arguments of LMPModel, "
+        "add it, or give the key of its leaf (the *_key arguments of LMPModel, "
         "set_keys of LMPLoss)",
     )
     if value.ndim == 0 or value.shape[-1] != width:
@@ -84,11 +84,11 @@ class LMPModel(TensorDictModuleBase):
       also reads the observation, ``[*B, D]`` for one step or ``[*B, κ, D]`` for a
       window, and returns one action for each.
 
-    Called on a tensordict, the model does what acting does: it reads one state and
-    a goal, draws a plan from the prior and decodes it.
+    Called on a tensordict, the model performs the steps of acting: it reads one state
+    and a goal, draws a plan from the prior and decodes it.
 
     The model normalises states, goals and actions, by statistics that
-    :meth:`fit_statistics` takes from the data. Decoded actions are in [-1, 1].
+    :meth:`fit_statistics` computes from the data. Decoded actions are in [-1, 1].
 
     Denormal numbers slow down the LSTM's backward pass on CPUs once many units are
     saturated; ``torch.set_flush_denormal(True)`` in the training script avoids that.
@@ -218,7 +218,7 @@ class LMPModel(TensorDictModuleBase):
             **floors,
         }
 
-        # The parts share these modules: each works on its own, and one call of
+        # The parts share these modules: each can be used on its own, and one call of
         # fit_statistics sets the statistics of all.
         self.observation_norm = RunningNorm(
             observation_dim, floor=observation_floor, frozen=True
@@ -296,7 +296,7 @@ class LMPModel(TensorDictModuleBase):
     def fit_statistics(
         self, tensordict: TensorDictBase, *, goals: Tensor | None = None
     ) -> LMPModel:
-        """Takes the statistics of states, goals and actions from data.
+        """Computes the statistics of states, goals and actions from data.
 
         The data are read in chunks, so that memory-mapped data are never loaded as a
         whole. Steps that the mask leaf flags as padding are left out. Nothing changes
@@ -306,9 +306,9 @@ class LMPModel(TensorDictModuleBase):
             tensordict (TensorDictBase): transitions, flat or in windows.
 
         Keyword Args:
-            goals (torch.Tensor, optional): the goals that will be requested,
-                ``[*, G]``, such as the achieved goals of all transitions if goals are
-                relabelled while sampling. Defaults to the leaf of the goals.
+            goals (torch.Tensor, optional): the goals that the model will be conditioned
+                on, ``[*, G]``, such as the achieved goals of all transitions if goals
+                are relabelled while sampling. Defaults to the leaf of the goals.
 
         Returns:
             LMPModel: the model itself.

@@ -30,8 +30,8 @@ class LMPActor(TensorDictModuleBase):
 
     Plan, actions and step counter are carried in the tensordict, as the hidden states
     of TorchRL's recurrent modules are: the actor reads them at the root and writes them
-    under ``"next"``, and the environment steps them. The environment has to know these
-    leaves: append :meth:`make_tensordict_primer` to it, and
+    under ``"next"``, and the environment steps them. The specs of the environment must
+    include these leaves: append :meth:`make_tensordict_primer` to it, and
     :class:`~torchrl.envs.InitTracker` for ``"is_init"``.
 
     Args:

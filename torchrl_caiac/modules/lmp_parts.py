@@ -44,10 +44,10 @@ def gaussian_plan(loc: Tensor, log_std: Tensor, noise: Tensor) -> Tensor:
 
 
 def plan_is_sampled(sample: bool) -> bool:
-    """Returns whether the exploration type in effect asks for a sampled plan.
+    """Returns whether the current exploration type requires a sampled plan.
 
     Args:
-        sample (bool): the answer if no exploration type is set.
+        sample (bool): the result if no exploration type is set.
 
     Returns:
         bool: ``True`` under ``ExplorationType.RANDOM``, ``False`` under any other
@@ -138,8 +138,8 @@ class PlanPosterior(nn.Module):
             hidden = self.lstm(inputs)[0][:, -1]
         else:
             mask = mask.reshape(-1, window)
-            # Padding may contain NaN. Its gradient is zero, but zero times NaN would
-            # still reach the weights, so it must not enter the LSTM.
+            # Padding may contain NaN. Its gradient is zero, but zero times NaN is NaN
+            # in the gradient of the weights, so it must not enter the LSTM.
             inputs = inputs.where(mask.unsqueeze(-1), torch.zeros_like(inputs))
             last = mask.sum(-1, keepdim=True).unsqueeze(-1) - 1
             hidden = self.lstm(inputs)[0].take_along_dim(last, dim=1).squeeze(1)
@@ -189,7 +189,7 @@ class PlanPrior(nn.Module):
         self.head = _PlanHead(hidden_size, plan_dim)
 
     def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Proposes plans.
+        """Computes the distribution of plans.
 
         Args:
             observation (torch.Tensor): the states in which plans start, ``[*B, D]``.

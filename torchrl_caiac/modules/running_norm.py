@@ -21,8 +21,8 @@ class RunningNorm(nn.Module):
 
     Each batch is merged into the statistics exactly (Chan's parallel form of Welford's
     update): every row counts once, whatever its batch. There are no affine parameters.
-    The result depends on the statistics only, not on the other rows of the batch. It
-    is the input itself until there are statistics.
+    The result depends on the statistics only, not on the other rows of the batch.
+    Without statistics the input is returned unchanged.
 
     In training mode :meth:`forward` first merges its input into the statistics; in
     evaluation mode, or with ``frozen``, it does not change them.
@@ -31,10 +31,10 @@ class RunningNorm(nn.Module):
         num_features (int): the size ``F`` of the last dimension.
 
     Keyword Args:
-        floor (float): the smallest standard deviation to divide by, in the units of
-            the features: a feature that hardly moves in the data would otherwise turn
-            small differences into large inputs. Defaults to ``0.0``: a constant
-            feature is centred and not scaled.
+        floor (float): the smallest standard deviation to divide by, in the units of the
+            features: a feature that hardly varies in the data would otherwise turn
+            small differences into large inputs. Defaults to ``0.0``: a constant feature
+            is centred and not scaled.
         frozen (bool): whether :meth:`forward` leaves the statistics as they are in
             training mode too, for statistics that are taken from data in advance.
             Defaults to ``False``.
@@ -85,7 +85,7 @@ class RunningNorm(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(num_features, dtype=torch.float64))
         self.register_buffer("m2", torch.zeros(num_features, dtype=torch.float64))
-        # What forward applies. It is kept, since computing it takes longer than using.
+        # What forward applies: cached, since computing it takes longer than using it.
         self.register_buffer("shift", torch.zeros(num_features))
         self.register_buffer("gain", torch.ones(num_features))
         self.register_buffer("divisor", torch.ones(num_features))
@@ -135,7 +135,7 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def replace(self, other: RunningNorm) -> None:
-        """Takes over the statistics of another layer, under the own floor.
+        """Copies the statistics of another layer, but keeps its own floor.
 
         Args:
             other (RunningNorm): the layer, of the same number of features.
@@ -155,10 +155,10 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def ignore(self, mask: torch.Tensor) -> None:
-        """Leaves features out: they become zero, until :meth:`replace` is called.
+        """Ignores features: they become zero until :meth:`replace` is called.
 
         Use it for features that are constant in the data. The weights that read them
-        stay as they were drawn, so other values at test time disturb the output.
+        keep their initial values, so other values at test time disturb the output.
 
         Args:
             mask (torch.Tensor): bool ``[F]``, true for the features to ignore.
@@ -179,7 +179,7 @@ class RunningNorm(nn.Module):
                 f"expected a bool mask [{self.num_features}], got {mask.dtype} "
                 f"{list(mask.shape)}"
             )
-        # An infinite variance outlasts further updates.
+        # An infinite variance stays infinite in further updates.
         self.m2.masked_fill_(mask.to(self.m2.device), math.inf)
         self._refresh()
 
@@ -226,7 +226,7 @@ def gather_statistics(
     mask: torch.Tensor | None = None,
     bound: float | None = None,
 ) -> RunningNorm:
-    """Takes the statistics of data, a chunk of rows at a time.
+    """Computes the statistics of data, one chunk of rows at a time.
 
     Memory-mapped data are thereby never loaded as a whole.
 
@@ -273,8 +273,8 @@ def gather_statistics(
             )
         if bound is not None and (rows.abs() > bound * (1.0 + 1e-4)).any():
             raise ValueError(
-                f"{key!r} reaches {float(rows.abs().max()):.4g}, expected values in "
-                f"[-{bound:g}, {bound:g}]: rescale it"
+                f"{key!r} has values up to {float(rows.abs().max()):.4g}, expected "
+                f"values in [-{bound:g}, {bound:g}]: rescale it"
             )
         statistics.update(rows)
     if not statistics.count:

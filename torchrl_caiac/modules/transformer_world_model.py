@@ -44,7 +44,7 @@ class TransformerWorldModel(EntityDynamicsModel):
 
     Keyword Args:
         feedforward (int, optional): the hidden width between two attentions. Defaults
-            to ``width``; the paper does not give it.
+            to ``width``; the paper does not state it.
         dropout (float): the dropout rate in every layer. Defaults to ``0.0``.
         widths (Mapping of str to int, optional): the number of features of each
             entity, ``layout.widths(td)``. Required for nested layouts only.
@@ -173,7 +173,7 @@ class TransformerWorldModel(EntityDynamicsModel):
     def nll(
         self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
     ) -> torch.Tensor:
-        """Returns the negative log likelihood under unit variance, less its constant.
+        """Returns the negative log likelihood for unit variance, without its constant.
 
         Args:
             prediction (tuple of torch.Tensor): the expectation, ``[*B, P]``.

@@ -39,16 +39,16 @@ class EntityDynamicsLoss(LossModule):
             :class:`~tensordict.nn.TensorDictParams`, as TorchRL's losses do, or has the
             model as a submodule. Both are the model's own parameters. Defaults to
             ``True``.
-        reduction (str): ``"mean"``, ``"sum"`` or ``"none"`` over the transitions, those
-            under the ``loss_mask_key`` of :class:`~torchrl.objectives.LossModule`
-            excepted. Defaults to ``"mean"``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"`` over the transitions,
+            except those under the ``loss_mask_key`` of
+            :class:`~torchrl.objectives.LossModule`. Defaults to ``"mean"``.
 
     Returns:
         TensorDict: ``"loss_nll"``, in nats per predicted column, and ``"mse"``, the
         squared error of the normalised targets, detached.
 
     Raises:
-        TypeError: the model is no world model.
+        TypeError: the model is not a world model.
         ValueError: the reduction is unknown.
 
     Examples:

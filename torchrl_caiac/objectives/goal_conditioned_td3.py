@@ -40,7 +40,7 @@ class GoalConditionedTD3Loss(TD3Loss):
       counterfactual ones contain the action of the expert before the swap.
     - The loss of the policy evaluates the first critic only.
     - The networks of this package are called with the parameters of the loss, those of
-      all critics at once, which takes a fifth of the time off a step. Parameters of
+      all critics at once, which saves a fifth of the time of a step. Parameters of
       other networks are swapped in and out as in TorchRL, with ``deactivate_vmap``.
 
     Everything else, such as :meth:`make_value_estimator` with the discount,
@@ -51,7 +51,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             :class:`~torchrl_caiac.modules.GoalConditionedActor`.
         qvalue_network (TensorDictModule or list of TensorDictModule): the critic
             ``Q(s, g, a)``. With a list of one module for each critic, their weights are
-            kept; of a single one TorchRL makes copies with newly drawn weights.
+            kept; TorchRL copies a single one and draws new weights.
 
     Keyword Args:
         bounds (tuple of float, optional): the bounds of the actions. Defaults to
@@ -69,7 +69,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             cloning term (TD3+BC: 2.5). Defaults to ``None``: no such term.
         bc_mask_key (NestedKey, optional): a bool leaf, ``[*B]`` or ``[*B, 1]``, true
             for the transitions to leave out of the behaviour cloning term, such as
-            ``("caiac", "counterfactual")``. Defaults to ``None``: all count.
+            ``("caiac", "counterfactual")``. Defaults to ``None``: none is left out.
         policy_noise (float): the standard deviation of the noise on the action of the
             target policy, in units of the action. Defaults to ``0.2``.
         noise_clip (float): the largest such noise. Defaults to ``0.5``.
@@ -308,7 +308,7 @@ class GoalConditionedTD3Loss(TD3Loss):
         inputs = self._inputs(tensordict, self._state_keys)
         inputs = _call(self.actor_network, inputs, self.actor_network_params)
         action = inputs.get(self.tensor_keys.action)
-        # Not detach(): tensordict caches it, and the cache outlasts a change of dtype.
+        # Not detach(): tensordict caches it, and the cache survives a change of dtype.
         critic = self.qvalue_network_params.data[0]
         inputs = _call(self.qvalue_network, inputs, critic)
         value = inputs.get(self.tensor_keys.state_action_value).squeeze(-1)

@@ -103,7 +103,7 @@ class LMPLoss(LossModule):
     ``SliceSampler`` are flat; ``batch.reshape(-1, κ)`` turns them into windows. Windows
     that are padded at their end have a bool leaf ``"mask"``, ``[*B, κ]`` or
     ``[*B, κ, 1]``, true for the valid steps. TorchRL's own masks (``loss_mask_key`` of
-    :class:`~torchrl.objectives.LossModule`) are honoured too.
+    :class:`~torchrl.objectives.LossModule`) are applied too.
 
     The loss is not functional: its parameters are the model's.
 

@@ -1,4 +1,4 @@
-"""Replay-buffer transforms that make counterfactual samples."""
+"""Replay-buffer transforms that create counterfactual samples."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ __all__ = ["CAIACTransform"]
 class CAIACTransform(CounterfactualTransform):
     """Swaps entities that the agent does not influence with those of other samples.
 
-    Append it to a replay buffer whose rows carry scores (see
+    Append it to a replay buffer whose rows have scores (see
     :func:`~torchrl_caiac.influence.score_buffer`). It makes the last
     ``round(counterfactual_ratio * B)`` rows of every batch counterfactual: every entity
     whose score is at most ``threshold`` takes its state and next state from a donor row
@@ -29,28 +29,30 @@ class CAIACTransform(CounterfactualTransform):
     is a whole window of one trajectory. Actions, all rows that are not counterfactual,
     and the storage never change.
 
-    Goals follow the swap where the layout maps them: achieved, next achieved and
-    desired goals, also under ``next``, as far as the batch has them. Rewards change
-    only with ``reward_fn``. Append :class:`~torchrl_caiac.transforms.WindowGoal`
-    before this transform and :class:`~torchrl_caiac.transforms.HindsightGoal` after it.
+    Goals follow the swap if the layout maps them: achieved, next achieved and desired
+    goals, also under ``next``, if the batch has them. Rewards change only with
+    ``reward_fn``. Append :class:`~torchrl_caiac.transforms.WindowGoal` before this
+    transform and :class:`~torchrl_caiac.transforms.HindsightGoal` after it.
 
-    The batch gains two leaves: ``keys.counterfactual``, bool ``[B * κ, 1]``, flags the
-    counterfactual rows (even if there was nothing to swap), and ``keys.swapped``, bool
-    ``[B * κ, N]``, the entities that were swapped, the same for all rows of a window.
+    Two leaves are added to the batch: ``keys.counterfactual``, bool ``[B * κ, 1]``,
+    flags the counterfactual rows (even if there was nothing to swap), and
+    ``keys.swapped``, bool ``[B * κ, N]``, the entities that were swapped, the same for
+    all rows of a window.
 
     Donors in the batch are always *other* windows, as they were stored; a sampler that
     draws with replacement may still return the same rows twice. Donors from a buffer
-    are any of its windows. An entity without a donor stays, is not flagged as swapped,
-    and increases :attr:`no_donor_count`.
+    can be any of its eligible windows. An entity without a donor is neither swapped nor
+    flagged as swapped, and increases :attr:`no_donor_count`.
 
-    Rows that are written through this transform get NaN as their scores, whatever they
-    carry: they count as not scored, are never swapped and never donate, and sampling
-    them raises until :func:`~torchrl_caiac.influence.score_buffer` is called again.
+    The scores of rows that are written through this transform are replaced by NaN,
+    which means not scored. Such rows are never swapped and never used as donors, and
+    sampling them raises an error until :func:`~torchrl_caiac.influence.score_buffer` is
+    called again.
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
-        threshold (float): the largest score of an uninfluenced entity, θ of eq. 3.3,
-            in nats for CAI. Defaults to 0.05.
+        threshold (float): the largest score of an uninfluenced entity, θ of section
+            3.3, in nats for CAI. Defaults to 0.05.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual, in [0, 1]. Defaults to 0.5.
 
@@ -58,24 +60,24 @@ class CAIACTransform(CounterfactualTransform):
         swap_prob (float): probability of swapping each uninfluenced entity. Defaults
             to 1.
         window (int): rows in a window, κ. Defaults to 1.
-        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn.
+        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
             Defaults to the rows of the same batch. A buffer has to be scored, have the
             same layout, and be one-dimensional. Pickling the transform pickles it.
         score_key (NestedKey): the scores, ``[*, N]``. Defaults to
             ``("caiac", "score")``.
         reward_fn (callable, optional): ``(next_achieved [C, G], desired [C, G])`` to
             rewards ``[C]`` or ``[C, 1]``; recomputes the rewards of counterfactual
-            rows. Defaults to none: rewards stay as they are stored.
+            rows. Defaults to ``None``: the stored rewards are kept.
         goals (WindowGoal, optional): draws the goals of donor windows of a donor
-            buffer; without it they are the stored ones. Donors in the batch bring the
-            goals that the batch has for them.
+            buffer; without it they are the stored ones. Donors in the batch keep the
+            goals that they have in the batch.
         generator (torch.Generator, optional): source of randomness. Defaults to
             torch's default generator. The same state gives the same batch.
         keys (TransformKeys, optional): rewards, trajectory ids, end flags and the
             flags that are written. Defaults to ``TransformKeys()``.
-        check (bool): check the values of each batch: scores, windows, observations.
-            On a CUDA device nothing waits for the result, so that an error comes with
-            a later sample. Defaults to ``True``.
+        check (bool): check the values of each batch: scores, windows, observations. On
+            a CUDA device nothing waits for the result, so an error is raised at a later
+            sample. Defaults to ``True``.
 
     Raises:
         TypeError: an argument has the wrong type.
@@ -141,7 +143,7 @@ class CAIACTransform(CounterfactualTransform):
         self._swappable = ~layout.fixed_mask
 
     def swappable(self, scores: torch.Tensor) -> torch.Tensor:
-        """Returns the entities of each window that may be swapped (eq. 3.3 and 1).
+        """Returns the entities of each window that may be swapped (section 3.3, eq. 1).
 
         Args:
             scores (torch.Tensor): ``[B * window, N]``.

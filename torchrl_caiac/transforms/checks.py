@@ -33,13 +33,13 @@ def check_number(name: str, value: Any, high: float) -> float:
     Args:
         name (str): the argument.
         value (Any): its value.
-        high (float): the upper limit, perhaps infinite.
+        high (float): the upper limit, which may be infinite.
 
     Returns:
         float: the number.
 
     Raises:
-        TypeError: it is no number.
+        TypeError: it is not a number.
         ValueError: it is out of range or not finite.
 
     Examples:
@@ -47,29 +47,29 @@ def check_number(name: str, value: Any, high: float) -> float:
         >>> check_number("swap_prob", 2, 1.0)
         Traceback (most recent call last):
         ...
-        ValueError: swap_prob is in [0, 1], got 2
+        ValueError: swap_prob must be in [0, 1], got 2
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{name} is a number, got {value!r}")
+        raise TypeError(f"{name} must be a number, got {value!r}")
     if not 0 <= value <= high or not math.isfinite(value):
         limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"
-        raise ValueError(f"{name} is {limits}, got {value!r}")
+        raise ValueError(f"{name} must be {limits}, got {value!r}")
     return float(value)
 
 
 def check_layout(layout: Any) -> EntityLayout:
     """Returns the layout, or raises a ``TypeError`` if it is none."""
     if not isinstance(layout, EntityLayout):
-        raise TypeError(f"layout is an EntityLayout, got {type(layout).__name__}")
+        raise TypeError(f"layout must be an EntityLayout, got {type(layout).__name__}")
     return layout
 
 
 def check_window(window: Any) -> int:
     """Returns a number of rows, or raises a ``TypeError`` or ``ValueError``."""
     if isinstance(window, bool) or not isinstance(window, int):
-        raise TypeError(f"window is a number of rows, an int; got {window!r}")
+        raise TypeError(f"window must be a number of rows, an int; got {window!r}")
     if window < 1:
-        raise ValueError(f"window is at least 1 row, got {window}")
+        raise ValueError(f"window must be at least 1 row, got {window}")
     return window
 
 
@@ -77,7 +77,7 @@ def check_generator(generator: Any) -> torch.Generator | None:
     """Returns a generator or ``None``, or raises a ``TypeError``."""
     if generator is not None and not isinstance(generator, torch.Generator):
         raise TypeError(
-            f"generator is a torch.Generator, got {type(generator).__name__}"
+            f"generator must be a torch.Generator, got {type(generator).__name__}"
         )
     return generator
 
@@ -86,7 +86,7 @@ def check_reward_fn(reward_fn: Any) -> Any:
     """Returns a function, or raises a ``TypeError``."""
     if not callable(reward_fn):
         raise TypeError(
-            "reward_fn is a function of the next achieved and the desired goals, got "
+            "reward_fn must be a function of the next achieved and desired goals, got "
             f"{type(reward_fn).__name__}"
         )
     return reward_fn
@@ -100,8 +100,8 @@ class LateCheck:
 
     Reading a value from an accelerator waits until all work before it is done. Here
     values are added up on the device, batch after batch, so that NaN or an infinity
-    stays in the sum, and the sums are copied to the host asynchronously. The host sees
-    what has arrived: usually all batches but the newest ones.
+    stays in the sum, and the sums are copied to the host asynchronously. The host reads
+    the sums that have arrived, usually those of all batches but the newest.
 
     Examples:
         >>> import torch
@@ -114,12 +114,12 @@ class LateCheck:
     """
 
     def __init__(self) -> None:
-        # The sums on the device, and what of them has arrived on the host.
+        # The sums on the device, and their copies on the host.
         self._sums: tuple[torch.Tensor, torch.Tensor] | None = None
 
     @staticmethod
     def needed(device: torch.device) -> bool:
-        """Whether reading a value on this device would wait for it.
+        """Returns whether reading a value on this device would wait for it.
 
         Args:
             device (torch.device): where the values are.
@@ -150,7 +150,7 @@ class LateCheck:
         arrived.copy_(sums, non_blocking=True)
 
     def found(self) -> list[int]:
-        """Returns what was not finite in a batch that has arrived, and then forgets it.
+        """Returns and clears the places that were not finite in arrived batches.
 
         Returns:
             list of int: places in ``values``.
@@ -164,14 +164,14 @@ class LateCheck:
         return bad
 
     def __reduce__(self) -> tuple[type[LateCheck], tuple[()]]:
-        return LateCheck, ()  # a copy has seen nothing yet
+        return LateCheck, ()  # a copy starts empty
 
 
 class BatchCheck:
-    """Raises where the values of a batch make no sense.
+    """Raises if the values of a batch are invalid.
 
     Scores and observations must be finite, and windows must stay within trajectories.
-    On a CUDA device nothing waits for the result: an error comes with a later batch.
+    On a CUDA device nothing waits for the result: an error is raised at a later batch.
 
     Args:
         layout (EntityLayout): the entities.
@@ -180,7 +180,7 @@ class BatchCheck:
         score_key (NestedKey): the scores.
         window (int): rows in a window.
         keys (TransformKeys): trajectory ids and end flags.
-        scores_name (str): how errors call the scores.
+        scores_name (str): the name of the scores in error messages.
     """
 
     def __init__(
@@ -232,9 +232,9 @@ class BatchCheck:
             self._explain(after, scores, states, neighbours)
             names = [self.score_key, *states, "the windows"]
             raise ValueError(
-                f"{[names[place] for place in found]} made no sense in an earlier "
+                f"{[names[place] for place in found]} were invalid in an earlier "
                 f"batch: {self.scores_name} or observations are NaN or infinite, or "
-                "windows cross a trajectory's end. On a CUDA device errors come late; "
+                "windows cross a trajectory's end. On a CUDA device errors are late; "
                 "sample the same data on the CPU to find the rows"
             )
         sums = [leaf.sum(dtype=torch.float64) for leaf in leaves]
@@ -246,7 +246,7 @@ class BatchCheck:
     def _neighbours(
         self, td: TensorDictBase
     ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Two ``[B, window - 1]`` that are equal where windows stay in a trajectory."""
+        """Returns two ``[B, window - 1]``, equal where windows stay in a trajectory."""
         if self.window == 1:
             return None
         keys = self.keys
@@ -299,6 +299,6 @@ class BatchCheck:
                 )
 
     def _entities(self, bad: torch.Tensor) -> list[str]:
-        """The entities that have a bad score, ``[*, N]``."""
+        """Returns the entities that have a bad score, ``[*, N]``."""
         columns = bad.reshape(-1, bad.shape[-1]).any(0).nonzero()[:, 0]
         return [self.layout.names[column] for column in columns.tolist()]

@@ -24,47 +24,47 @@ __all__ = ["CoDATransform"]
 class CoDATransform(CounterfactualTransform):
     """Swaps independent parts of a state with those of other samples (CoDA).
 
-    The baseline of Pitis et al. (2020) that the paper compares with. Each row carries
-    a graph of local influence, from the entities and the action to the entities (see
+    The baseline of Pitis et al. (2020) that the paper compares with. Each row has a
+    graph of local influence, from the entities and the action to the entities (see
     :class:`~torchrl_caiac.influence.AttentionInfluence`). Scores above ``threshold``
     are links, in either direction, and links form connected components. In the last
     ``round(counterfactual_ratio * B)`` rows of a batch, every component that does not
     contain the action takes its states and next states from a donor row in which the
     same set of entities is a component without the action too. Components draw their
-    donors independently; the entities of one component share theirs. With ``window``
-    κ > 1, entities belong together if they are linked in any row of the window.
+    donors independently; the entities of one component share a donor. With ``window`` κ
+    > 1, entities belong together if they are linked in any row of the window.
 
     A component that contains a ``fixed`` entity is not swapped. Goals, rewards, flags,
     checks, donors in the batch or from a buffer, unscored rows, missing donors and the
-    order of transforms: all as in :class:`~torchrl_caiac.CAIACTransform`, which with
-    the scores of the action alone (``AttentionInfluence(model, action_only=True)``) is
+    order of transforms are as in :class:`~torchrl_caiac.CAIACTransform`, which with the
+    scores of the action alone (``AttentionInfluence(model, action_only=True)``) is
     CoDA-action.
 
     Args:
         layout (EntityLayout): at most 64 entities.
-        threshold (float): the largest score of what is no link, θ. Defaults to 0.2.
+        threshold (float): scores above it are links, θ. Defaults to 0.2.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual, in [0, 1]. Defaults to 0.5.
 
     Keyword Args:
         swap_prob (float): probability of swapping each component. Defaults to 1.
         window (int): rows in a window, κ. Defaults to 1.
-        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn.
+        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
             Defaults to the rows of the same batch. Pickling the transform pickles it.
         graph_key (NestedKey): the graphs, ``[*, N + 1, N]``: from the row (the
             entities in layout order, then the action) to the column. Defaults to
             ``("coda", "graph")``.
         reward_fn (callable, optional): ``(next_achieved [C, G], desired [C, G])`` to
             rewards ``[C]`` or ``[C, 1]``; recomputes the rewards of counterfactual
-            rows. Defaults to none: rewards stay as they are stored.
+            rows. Defaults to ``None``: the stored rewards are kept.
         goals (WindowGoal, optional): draws the goals of donor windows of a donor
             buffer; without it they are the stored ones.
         generator (torch.Generator, optional): source of randomness. Defaults to
             torch's default generator. The same state gives the same batch.
         keys (TransformKeys, optional): rewards, trajectory ids, end flags and the
             flags that are written. Defaults to ``TransformKeys()``.
-        check (bool): check the values of each batch: graphs, windows, observations;
-            on a CUDA device an error comes with a later sample. Defaults to ``True``.
+        check (bool): check the values of each batch: graphs, windows, observations; on
+            a CUDA device an error is raised at a later sample. Defaults to ``True``.
 
     Raises:
         TypeError: an argument has the wrong type.
@@ -139,7 +139,7 @@ class CoDATransform(CounterfactualTransform):
 
     @property
     def graph_key(self) -> NestedKey:
-        """Where the graphs are."""
+        """The key of the graphs."""
         return self.score_key
 
     @property
@@ -148,7 +148,7 @@ class CoDATransform(CounterfactualTransform):
         return len(self.layout) + 1, len(self.layout)
 
     def swappable(self, scores: torch.Tensor) -> torch.Tensor:
-        """The components of each window that may be swapped, :func:`components`.
+        """Returns the swappable components of each window, see :func:`components`.
 
         Args:
             scores (torch.Tensor): the graphs ``[B * window, N + 1, N]``.

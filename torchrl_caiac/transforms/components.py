@@ -1,7 +1,7 @@
 """Connected components of local graphs, and drawing donors for them (CoDA).
 
-A component is an int64 bit mask, the bit ``i`` set for the entity ``i``, so at most 64
-entities. Notation as in :mod:`torchrl_caiac.transforms.draws`.
+A component is an int64 bit mask with bit ``i`` set for entity ``i``, so that there are
+at most 64 entities. Notation as in :mod:`torchrl_caiac.transforms.draws`.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class ComponentIndex(NamedTuple):
     """The rows of a storage at which donor windows may start, component by component.
 
     Attributes:
-        masks (torch.Tensor): int64 ``[U]``, ascending, the components there are.
+        masks (torch.Tensor): int64 ``[U]``, ascending, the components that occur.
         starts (torch.Tensor): integer ``[M]``, the rows for the first component, then
             for the second, and so on.
         offset (torch.Tensor): int64 ``[U]``, where a component's rows begin.
-        size (torch.Tensor): int64 ``[U]``, how many it has.
+        size (torch.Tensor): int64 ``[U]``, the number of its rows.
     """
 
     masks: torch.Tensor
@@ -56,25 +56,25 @@ class ComponentIndex(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _bits(entities: int, device: torch.device) -> torch.Tensor:
-    """The bit of each entity, int64 ``[N]``."""
+    """Returns the bit of each entity, int64 ``[N]``."""
     bits = [1 << i if i < 63 else -(1 << 63) for i in range(entities)]
     return torch.tensor(bits, dtype=torch.int64, device=device)
 
 
 @lru_cache(maxsize=64)
 def _lower_bits(entities: int, device: torch.device) -> torch.Tensor:
-    """The bits of the entities before each one, int64 ``[N]``."""
+    """Returns the bits of the entities before each one, int64 ``[N]``."""
     lower = [(1 << i) - 1 for i in range(entities)]
     return torch.tensor(lower, dtype=torch.int64, device=device)
 
 
 def _packed(chosen: torch.Tensor) -> torch.Tensor:
-    """The bit mask of bools ``[*, N]``, int64 ``[*]``."""
+    """Returns the bit mask of bools ``[*, N]``, int64 ``[*]``."""
     return (chosen * _bits(chosen.shape[-1], chosen.device)).sum(-1)
 
 
 def _links(graphs: torch.Tensor, threshold: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """What each entity is linked to, ``[R, N]``, and the action, ``[R]``."""
+    """Returns the links of each entity, ``[R, N]``, and of the action, ``[R]``."""
     entities = graphs.shape[-1]
     # NaN, that is not scored, links everything: nothing may be swapped.
     linked = ~(graphs <= threshold)
@@ -83,7 +83,7 @@ def _links(graphs: torch.Tensor, threshold: float) -> tuple[torch.Tensor, torch.
 
 
 def _joined(links: torch.Tensor, held: torch.Tensor) -> torch.Tensor:
-    """The component of each entity, 0 where it touches ``held``, int64 ``[R, N]``."""
+    """Returns each entity's component, 0 if it touches ``held``, int64 ``[R, N]``."""
     entities = links.shape[-1]
     # Warshall's closure of all graphs at once: what reaches k reaches what k does.
     masks = links.t().contiguous() | _bits(entities, links.device).unsqueeze(-1)
@@ -93,13 +93,13 @@ def _joined(links: torch.Tensor, held: torch.Tensor) -> torch.Tensor:
 
 
 def _leads(masks: torch.Tensor) -> torch.Tensor:
-    """Whether an entity is the first one of its component, bool ``[R, N]``."""
+    """Returns whether an entity is the first one of its component, bool ``[R, N]``."""
     lower = _lower_bits(masks.shape[-1], masks.device)
     return (masks & lower == 0) & (masks != 0)
 
 
 def _leader(masks: torch.Tensor) -> torch.Tensor:
-    """The first entity of each component, int64 ``[R, N]``, 0 where there is none."""
+    """Returns the first entity of each component, int64 ``[R, N]``, 0 for none."""
     # As a power of two in float64, which is exact, bit 63 (the sign) included.
     lowest = (masks & -masks).double().abs()
     return (torch.frexp(lowest).exponent - 1).clamp_min(0).long()
@@ -112,7 +112,7 @@ def components(
     window: int = 1,
     fixed: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """The component of each entity in each window's graph (CoDA).
+    """Returns the component of each entity in each window's graph (CoDA).
 
     Two entities belong together where, in any row of the window and in any direction,
     one influences the other by more than ``threshold``, or by a chain of such links.
@@ -121,10 +121,10 @@ def components(
     Args:
         graphs (torch.Tensor): ``[B * window, N + 1, N]``, from the row (the entities,
             then the action) to the column; NaN, not scored, counts as a link.
-        threshold (float): the largest score of what is no link, θ.
+        threshold (float): scores above it are links, θ.
 
     Keyword Args:
-        window (int): rows a window. Defaults to 1.
+        window (int): rows in a window. Defaults to 1.
         fixed (torch.Tensor, optional): bool ``[N]``, entities that are never swapped.
 
     Returns:
@@ -151,7 +151,7 @@ def components(
 def _shared(
     masks: torch.Tensor, swap_prob: float, generator: torch.Generator | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """What the entities of a component share: leader, random number, being chosen."""
+    """Draws what a component shares: leader, random number, whether it is chosen."""
     leader, device = _leader(masks), masks.device
     is_chosen = masks != 0
     if swap_prob < 1.0:
@@ -179,10 +179,11 @@ def draw_batch_components(
 
     Args:
         masks (torch.Tensor): int64 ``[B, N]``, of :func:`components`.
-        num_counterfactual (int): how many windows become counterfactual, ``C``.
+        num_counterfactual (int): the number of windows that become counterfactual,
+            ``C``.
 
     Keyword Args:
-        window (int): rows a window. Defaults to 1.
+        window (int): rows in a window. Defaults to 1.
         swap_prob (float): probability of swapping a component. Defaults to 1.
         generator (torch.Generator, optional): source of randomness.
 
@@ -209,7 +210,7 @@ def draw_batch_components(
     begin = torch.searchsorted(keys, tail)
     others = torch.searchsorted(keys, tail, right=True) - begin - 1
     chosen = begin + pick % others.clamp_min(1)
-    # A window is among those of its own component: step over it.
+    # A window is among those of its own component: skip it.
     chosen += chosen >= place.view(windows, entities)[first:].gather(1, leader)
     donors = pick_rows(order, chosen.clamp_max(order.shape[0] - 1)) // entities
     swapped = is_chosen & (others > 0)
@@ -264,7 +265,7 @@ def draw_buffer_components(
 
 
 def _slid(links: torch.Tensor, window: int) -> torch.Tensor:
-    """All links of each row and of the ``window - 1`` rows after it."""
+    """Returns all links of each row and of the ``window - 1`` rows after it."""
     size = 1
     while size < window:
         step = min(size, window - size)
@@ -289,11 +290,11 @@ def component_starts(
 
     Args:
         graphs (torch.Tensor): ``[T, N + 1, N]``, NaN where a row was not scored.
-        threshold (float): the largest score of what is no link, θ.
+        threshold (float): scores above it are links, θ.
         fixed (torch.Tensor): bool ``[N]``, entities that are never swapped.
 
     Keyword Args:
-        window (int): rows a window. Defaults to 1.
+        window (int): rows in a window. Defaults to 1.
         trajectories (TrajectoryIndex, optional): needed for windows of several rows.
 
     Returns:
@@ -329,17 +330,17 @@ def component_starts(
         starts.append(rows.to(dtype).unsqueeze(-1).expand_as(leads)[leads])
     found, order = torch.cat(masks).sort(stable=True)
     rows = torch.cat(starts)[order]
-    if not len(found):  # an index needs a component to point at; 0 is none
+    if not len(found):  # the index needs at least one component; 0 is none
         found, rows = found.new_zeros(1), rows.new_zeros(1)
     unique, size = torch.unique_consecutive(found, return_counts=True)
     return ComponentIndex(unique, rows, size.cumsum(0) - size, size)
 
 
 class ComponentDonors(BufferDonors):
-    """A replay buffer whose windows donate components.
+    """A replay buffer whose windows are donors of components.
 
     As :class:`~torchrl_caiac.transforms.donors.BufferDonors`, with graphs in
-    ``score_key`` and bit masks in the place of free entities.
+    ``score_key`` and bit masks instead of free entities.
     """
 
     scores_name: ClassVar[str] = "graphs"

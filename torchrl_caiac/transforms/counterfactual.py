@@ -1,4 +1,4 @@
-"""What augmentations share: from scores to counterfactual transitions."""
+"""The base class of augmentations: from scores to counterfactual transitions."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ _Transform = TypeVar("_Transform", bound="CounterfactualTransform")
 
 
 class CounterfactualTransform(Transform, ABC):
-    """Makes the last rows of a batch counterfactual, by the scores that they carry.
+    """Makes the last rows of a batch counterfactual, by their scores.
 
-    A subclass says what may be swapped (:meth:`swappable`) and with whom
-    (:attr:`draw_in_batch`; :attr:`donors_class` for a donor buffer). Each sample takes
-    the same steps: scores, draw, swap, rewards, check. See
-    :class:`~torchrl_caiac.transforms.CAIACTransform` for what a batch gains.
+    A subclass defines what may be swapped (:meth:`swappable`) and how donors are drawn
+    (:attr:`draw_in_batch`; :attr:`donors_class` for a donor buffer). The steps of a
+    sample are: scores, draw, swap, rewards, check. See
+    :class:`~torchrl_caiac.transforms.CAIACTransform` for the leaves that are added.
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
-        threshold (float): the largest score of what is no influence, θ.
+        threshold (float): scores above it count as influence, θ.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual.
 
     Keyword Args:
         swap_prob (float): probability of swapping what may be swapped.
         window (int): rows in a window, κ.
-        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn.
+        donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
         score_key (NestedKey): the scores.
         reward_fn (callable, optional): recomputes rewards of counterfactual rows.
         goals (WindowGoal, optional): draws the goals of donor windows.
@@ -135,11 +135,11 @@ class CounterfactualTransform(Transform, ABC):
         self, goals: Any, donors: ReplayBuffer | TensorStorage | None
     ) -> None:
         if not isinstance(goals, WindowGoal):
-            raise TypeError(f"goals is a WindowGoal, got {type(goals).__name__}")
+            raise TypeError(f"goals must be a WindowGoal, got {type(goals).__name__}")
         if donors is None:
             raise ValueError(
                 "goals draws the goals of donor windows of a donor buffer, and there "
-                "is none: donors in the batch bring their goals with them"
+                "is none: donors in the batch keep their own goals"
             )
         if goals.window != self.window or goals.layout != self.layout:
             raise ValueError(
@@ -147,7 +147,7 @@ class CounterfactualTransform(Transform, ABC):
                 f"has window {self.window}: both must be the same"
             )
 
-    # --- what augmentations differ in ------------------------------------------------
+    # --- defined by subclasses -------------------------------------------------------
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
@@ -169,15 +169,15 @@ class CounterfactualTransform(Transform, ABC):
 
     @property
     def donors(self) -> ReplayBuffer | TensorStorage | None:
-        """Where donors are drawn; ``None`` for the batch."""
+        """The buffer that donors are drawn from; ``None`` for the batch."""
         return self._donors[0].donors if self._donors else None
 
     @property
     def no_donor_count(self) -> torch.Tensor:
-        """How often each entity should have been swapped and had no donor.
+        """The number of times that each entity had no donor.
 
-        int64 ``[N]``, in windows, since the transform was created or
-        :meth:`reset_no_donor_count` was called.
+        int64 ``[N]``, windows in which it was to be swapped, since the transform was
+        created or :meth:`reset_no_donor_count` was called.
         """
         return self._no_donor.clone()
 
@@ -223,7 +223,7 @@ class CounterfactualTransform(Transform, ABC):
     def generate_parameters(
         self, scores: torch.Tensor, generator: torch.Generator | None = None
     ) -> SwapDraw:
-        """Draws what is swapped, and with whom.
+        """Draws what is swapped, and the donors.
 
         Args:
             scores (torch.Tensor): the batch's, ``[B * window, *feature_shape]``.
@@ -256,7 +256,7 @@ class CounterfactualTransform(Transform, ABC):
         """Applies a draw: the same draw gives the same batch.
 
         Args:
-            tensordict (TensorDictBase): the batch ``[B * window]``; it stays as it is.
+            tensordict (TensorDictBase): the batch ``[B * window]``; it is not changed.
             draw (SwapDraw): from :meth:`generate_parameters`.
 
         Returns:
@@ -300,7 +300,7 @@ class CounterfactualTransform(Transform, ABC):
             tensordict (TensorDictBase): the batch ``[B * window]``, with scores.
 
         Returns:
-            TensorDictBase: a shallow copy with new leaves; the input stays as it is.
+            TensorDictBase: a shallow copy with new leaves; the input is not changed.
 
         Raises:
             KeyError: scores, or a leaf that the layout names, are missing.
@@ -331,8 +331,8 @@ class CounterfactualTransform(Transform, ABC):
             )
         if td.shape[0] % self.window:
             raise ValueError(
-                f"the batch has {td.shape[0]} rows, which windows of {self.window} do "
-                f"not divide: sample slices of this length, e.g. SliceSampler("
+                f"the batch has {td.shape[0]} rows, not a multiple of the window "
+                f"{self.window}: sample slices of this length, e.g. SliceSampler("
                 f"slice_len={self.window}), and a batch size that is a multiple of it"
             )
         if td.get(self.keys.relabeled, None) is not None:
@@ -346,7 +346,7 @@ class CounterfactualTransform(Transform, ABC):
             donors = self.donors_class
             raise KeyError(
                 f"the batch has no {donors.scores_name} in {self.score_key!r}: call "
-                "score_buffer on the replay buffer, or name their key by "
+                "score_buffer on the replay buffer, or name their key with "
                 f"{donors.key_argument}"
             )
         expected = (td.shape[0], *self.feature_shape)

@@ -1,4 +1,4 @@
-"""Donors from a replay buffer: which of its windows may donate, and reading them."""
+"""Donors from a replay buffer: finding its eligible windows, and reading them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def scan_donors(
         step (int): windows in a part.
         window (int): rows in a window.
         trajectories (TrajectoryIndex, optional): needed for windows of several rows.
-        what (str): how errors call the values.
+        what (str): the name of the values in error messages.
 
     Yields:
         tuple of torch.Tensor: the rows ``[R]`` and their values ``[R, ...]``.
@@ -77,7 +77,7 @@ def eligible_starts(
     window: int = 1,
     trajectories: TrajectoryIndex | None = None,
 ) -> DonorIndex:
-    """Finds the rows at which a window starts that an entity passes uninfluenced.
+    """Finds the rows at which windows start in which an entity is uninfluenced.
 
     All rows of such a window belong to one trajectory and have scores of at most
     ``threshold``; a row without a score (NaN) is never part of one. The index takes
@@ -89,7 +89,7 @@ def eligible_starts(
         swappable (torch.Tensor): bool ``[N]``; other entities get no rows.
 
     Keyword Args:
-        window (int): rows a window. Defaults to 1.
+        window (int): rows in a window. Defaults to 1.
         trajectories (TrajectoryIndex, optional): needed for windows of several rows.
 
     Returns:
@@ -124,13 +124,13 @@ def eligible_starts(
     lists = [rows.to(device) for rows in lists]
     size = torch.tensor([rows.numel() for rows in lists], device=device)
     starts = torch.cat(lists)
-    if not starts.numel():  # an index needs a row to point at
+    if not starts.numel():  # the index needs at least one row
         starts = torch.zeros(1, dtype=dtype, device=device)
     return DonorIndex(starts, size.cumsum(0) - size, size)
 
 
 class BufferDonors:
-    """A replay buffer whose windows donate entities.
+    """A replay buffer whose windows are donors of entities.
 
     The index of eligible windows is built at the first draw, and again after each
     write to the buffer. Rows are read leaf by leaf, and of each leaf only what an
@@ -149,7 +149,7 @@ class BufferDonors:
         goals (WindowGoal, optional): draws the goals of donor windows.
 
     Raises:
-        TypeError: ``donors`` is no buffer or storage.
+        TypeError: ``donors`` is not a buffer or storage.
     """
 
     scores_name: ClassVar[str] = "scores"
@@ -168,8 +168,8 @@ class BufferDonors:
     ) -> None:
         if not isinstance(donors, (ReplayBuffer, TensorStorage)):
             raise TypeError(
-                "donors is a ReplayBuffer (or its storage), or None to draw from the "
-                f"batch; got {type(donors).__name__}"
+                "donors must be a ReplayBuffer (or its storage), or None to draw from "
+                f"the batch; got {type(donors).__name__}"
             )
         self.donors = donors
         self.layout = layout
@@ -179,7 +179,7 @@ class BufferDonors:
         self.keys = keys
         self.goals = goals
         self._built: tuple[Any, Any, TrajectoryIndex | None] | None = None
-        # The donors' leaves for the last plan, and the tensordict that they are of.
+        # The donors' leaves for the last plan, and the tensordict that they come from.
         self._read: tuple[SwapPlan, TensorDictBase, list[torch.Tensor]] | None = None
 
     @property
@@ -230,7 +230,7 @@ class BufferDonors:
         if scores is None:
             raise KeyError(
                 f"the donor buffer has no {self.scores_name} in {self.score_key!r}: "
-                f"call score_buffer on it, or name their key by {self.key_argument}"
+                f"call score_buffer on it, or name their key with {self.key_argument}"
             )
         expected = (scores.shape[0], *self.feature_shape)
         if tuple(scores.shape) != expected:
@@ -248,7 +248,7 @@ class BufferDonors:
         return eligible, trajectories
 
     def _data(self) -> TensorDictBase:
-        """The storage's own tensordict, which may be longer than its content."""
+        """Returns the storage's tensordict, which may be longer than its content."""
         data = storage_data(self.storage, "the donor buffer")
         if self.storage.ndim != 1:
             raise ValueError(
@@ -318,7 +318,7 @@ class BufferDonors:
     def _sources(
         self, data: TensorDictBase, plan: SwapPlan, values: Sequence[torch.Tensor]
     ) -> list[torch.Tensor]:
-        """The donors' leaves in the order of the plan's, of the same rows."""
+        """Returns the donors' leaves in the order of the plan's, of the same rows."""
         found = []
         for leaf in plan.leaves:
             own = values[leaf.place]

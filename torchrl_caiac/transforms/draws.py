@@ -24,15 +24,15 @@ __all__ = [
 
 
 class SwapDraw(NamedTuple):
-    """What was drawn for one batch: who swaps, and with whom.
+    """The draw for one batch: the entities to swap, and their donors.
 
     Attributes:
         donors (torch.Tensor): int64 ``[C, N]``, the first row of each entity's donor
             window, a row of the batch or of the donor storage. Meaningless where
             nothing is swapped.
         swapped (torch.Tensor): bool ``[C, N]``.
-        no_donor (torch.Tensor): int64 ``[N]``, the windows whose entity should have
-            been swapped and found no donor.
+        no_donor (torch.Tensor): int64 ``[N]``, the number of windows in which the
+            entity was to be swapped but had no donor.
         goal_rows (torch.Tensor, optional): int64 ``[C, N]``, the row of the donor
             storage whose next state is the goal of the donor window.
     """
@@ -50,7 +50,7 @@ class DonorIndex(NamedTuple):
         starts (torch.Tensor): integer ``[M]``, the rows for the first entity, then
             for the second, and so on.
         offset (torch.Tensor): int64 ``[N]``, where an entity's rows begin.
-        size (torch.Tensor): int64 ``[N]``, how many it has.
+        size (torch.Tensor): int64 ``[N]``, the number of its rows.
     """
 
     starts: torch.Tensor
@@ -61,13 +61,13 @@ class DonorIndex(NamedTuple):
 def uninfluenced(
     scores: torch.Tensor, threshold: float, window: int = 1
 ) -> torch.Tensor:
-    """The entities that are uninfluenced in all rows of each window (eq. 3.3 and 1).
+    """Returns the entities that are uninfluenced in each window (section 3.3, eq. 1).
 
     Args:
         scores (torch.Tensor): ``[B * window, N]``; a row that was not scored (NaN) is
             not uninfluenced.
         threshold (float): the largest score of an uninfluenced entity, θ.
-        window (int): rows a window. Defaults to 1.
+        window (int): rows in a window. Defaults to 1.
 
     Returns:
         torch.Tensor: bool ``[B, N]``.
@@ -109,10 +109,11 @@ def draw_batch_donors(
 
     Args:
         free (torch.Tensor): bool ``[B, N]``, the entities that may be swapped.
-        num_counterfactual (int): how many windows become counterfactual, ``C``.
+        num_counterfactual (int): the number of windows that become counterfactual,
+            ``C``.
 
     Keyword Args:
-        window (int): rows a window. Defaults to 1.
+        window (int): rows in a window. Defaults to 1.
         swap_prob (float): probability of swapping a free entity. Defaults to 1.
         generator (torch.Generator, optional): source of randomness.
 
@@ -131,13 +132,14 @@ def draw_batch_donors(
     first = windows - num_counterfactual
     is_chosen = _drawn(free[first:], swap_prob, generator).t()
     free = free.t()
-    # rank[n, b]: how many free windows entity n has up to and including window b.
+    # rank[n, b]: the number of free windows of entity n up to and including window b.
     rank = free.cumsum(1)
     total, own = rank[:, -1:], rank[:, first:]
     # At least two, of which a remainder can be taken: with fewer there is no donor.
     size = total.clamp_min(2)
     pick = draw_integers(own.shape, device=free.device, generator=generator)
-    # Around the circle of free windows, from the one after the own, never back to it.
+    # Cyclic over the free windows, from the one after the entity's own to the one
+    # before.
     place = (pick % (size - 1) + own) % size
     # listed[n, r]: the free window of rank r, from 1; those that are not free end up
     # at 0.

@@ -1,4 +1,4 @@
-"""Reading rows and windows of tensors, as fast as it gets."""
+"""Fast reading of rows and windows of tensors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["pick_places", "pick_rows", "plain_tensor", "window_max", "window_sta
 
 
 def plain_tensor(tensor: torch.Tensor) -> torch.Tensor:
-    """A memory-mapped tensor as a plain one, whose indexing skips Python's dispatch.
+    """Returns a plain view of a memory-mapped tensor, which is faster to index.
 
     Args:
         tensor (torch.Tensor): any tensor.
@@ -42,14 +42,14 @@ def pick_rows(source: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
 
 
 def pick_places(source: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Returns single values of a tensor by their places in it as one vector.
+    """Returns single values of a tensor by their places in the flattened tensor.
 
     Args:
         source (torch.Tensor): ``[T, D]``.
         places (torch.Tensor): integer ``[M * D]``, row times ``D`` plus column.
 
     Returns:
-        torch.Tensor: ``[M, D]``, or another width where ``source`` is read partly.
+        torch.Tensor: ``[M, D]``, or another width if ``source`` is read partly.
 
     Examples:
         >>> import torch
@@ -64,12 +64,12 @@ def pick_places(source: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
 
 @lru_cache(maxsize=64)
 def window_starts(windows: int, window: int, device: torch.device) -> torch.Tensor:
-    """Returns the first row of each window of a flat batch; not to be written to.
+    """Returns the first row of each window of a flat batch; do not write to it.
 
     Args:
         windows (int): windows in the batch, ``B``.
         window (int): rows in a window.
-        device (torch.device): where it is needed.
+        device (torch.device): the device of the result.
 
     Returns:
         torch.Tensor: int64 ``[B]``.

@@ -21,7 +21,7 @@ class TransformKeys:
         reward (NestedKey): the rewards, ``[*B]`` or ``[*B, 1]``. Defaults to
             ``("next", "reward")``.
         trajectory (NestedKey, optional): the trajectory ids, ``[*B]`` or ``[*B, 1]``;
-            ``None`` to tell trajectories apart by end flags alone. Defaults to
+            ``None`` to separate trajectories by end flags alone. Defaults to
             ``"episode"``.
         done (NestedKey, optional): the end flags, ``[*B]`` or ``[*B, 1]``; ``None`` to
             ignore them. Defaults to ``("next", "done")``.

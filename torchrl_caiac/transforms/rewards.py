@@ -20,7 +20,7 @@ RewardFn = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 def _goal_vectors(
     td: TensorDictBase, layout: EntityLayout, first: int
 ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """The next achieved and the desired goals of the rows from ``first`` on."""
+    """Returns the next achieved and the desired goals of the rows from ``first`` on."""
     if layout.is_flat:
         desired = td.get(layout.desired_goal_key, None)
         achieved = td.get(layout.next(layout.achieved_goal_key), None)
@@ -68,11 +68,11 @@ def recompute_reward(
 
     Args:
         td (TensorDictBase): the batch after swapping, ``[R]``.
-        layout (EntityLayout): the entities. A nested layout's goals are laid side by
-            side, flattened, in layout order.
+        layout (EntityLayout): the entities. A nested layout's goals are concatenated,
+            flattened, in layout order.
         reward_fn (callable): ``(next_achieved [C, G], desired [C, G])`` to rewards
             ``[C]`` or ``[C, 1]``.
-        num_rows (int): how many rows get a new reward, ``C``.
+        num_rows (int): the number of rows whose rewards are recomputed, ``C``.
 
     Keyword Args:
         reward_key (NestedKey): the rewards ``[R]`` or ``[R, 1]``.
@@ -121,7 +121,7 @@ def recompute_reward(
 
 
 def stored_reward(td: TensorDictBase, reward_key: NestedKey) -> torch.Tensor:
-    """The rewards of a batch.
+    """Returns the rewards of a batch.
 
     Args:
         td (TensorDictBase): the batch ``[B]``.
@@ -138,7 +138,7 @@ def stored_reward(td: TensorDictBase, reward_key: NestedKey) -> torch.Tensor:
     if reward is None:
         raise KeyError(
             f"reward_fn is given, but the batch has no {reward_key!r}: name the "
-            "rewards by keys=TransformKeys(reward=...)"
+            "rewards with keys=TransformKeys(reward=...)"
         )
     if reward.numel() != td.shape[0]:
         raise ValueError(

@@ -1,8 +1,8 @@
 """Swapping entities between windows: the inner loop of Algorithm 1.
 
-What depends on the layout and on the structure of a batch alone (its leaves, the owner
-of every column, how columns are laid out) is resolved once, into a :class:`SwapPlan`.
-Notation as in :mod:`torchrl_caiac.transforms.draws`.
+Everything that depends only on the layout and on the structure of a batch (its leaves,
+the owner of every column, the order of columns) is computed once, in a
+:class:`SwapPlan`. Notation as in :mod:`torchrl_caiac.transforms.draws`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class SwapLeaf(NamedTuple):
 
 
 class SwapPlan(NamedTuple):
-    """What swapping in batches of one structure needs, resolved once.
+    """The plan of a swap, computed once for each structure of batches.
 
     Attributes:
         leaves (tuple of SwapLeaf): what follows a swap.
@@ -61,7 +61,7 @@ class SwapPlan(NamedTuple):
 
 
 class _Source(NamedTuple):
-    """A key of the layout that a swap concerns, if the batch has it."""
+    """A key of the layout that a swap affects, if the batch has it."""
 
     key: NestedKey
     kind: str  # "state" or "goal", of a flat layout
@@ -72,7 +72,7 @@ class _Source(NamedTuple):
 
 
 class SwapPlanner:
-    """Reads the leaves of batches, and makes the plan of each structure once.
+    """Reads the leaves of batches, and creates the plan of each structure once.
 
     Args:
         layout (EntityLayout): the entities.
@@ -99,7 +99,7 @@ class SwapPlanner:
 
     @property
     def keys(self) -> list[NestedKey]:
-        """The keys that a swap reads and writes, as far as a batch has them."""
+        """The keys that a swap reads and writes, if a batch has them."""
         has_goals = bool(self.layout.goal)
         return [s.key for s in self._sources if s.is_required or has_goals]
 
@@ -253,7 +253,7 @@ def _signature(value: Any) -> Hashable:
 def _expanded(
     sources: Sequence[_Source], found: list[Any]
 ) -> tuple[list[Any], Hashable]:
-    """The leaves below what a nested layout names, and what plans depend on."""
+    """Returns the leaves of a nested layout, and what plans depend on."""
     values: list[Any] = []
     signature: list[Hashable] = []
     for value in found:
@@ -271,7 +271,7 @@ def _expanded(
 def _expanded_keys(
     sources: Sequence[_Source], td: TensorDictBase
 ) -> tuple[list[NestedKey], list[_Source]]:
-    """The keys of the leaves of :func:`_expanded`, and whose they are."""
+    """Returns the keys of the leaves of :func:`_expanded`, and their owners."""
     keys: list[NestedKey] = []
     owners: list[_Source] = []
     for source in sources:
@@ -385,7 +385,7 @@ def apply_swap(
 def _inside(
     window: int, width: int, device: torch.device, dtype: torch.dtype
 ) -> torch.Tensor:
-    """The places of a window's values from its first one, ``[window, width]``."""
+    """Returns the places of a window's values from its first, ``[window, width]``."""
     places = torch.arange(window * width, device=device, dtype=dtype)
     return places.view(window, width)
 
@@ -393,7 +393,7 @@ def _inside(
 def _places(
     rows: torch.Tensor, leaf: SwapLeaf, window: int, length: int, num_rows: int | None
 ) -> torch.Tensor:
-    """Where the values of each donor window are in a source of ``length`` rows.
+    """Finds the values of each donor window in a source of ``length`` rows.
 
     Returns rows ``[C * window]`` for one entity's leaf; for columns, places
     ``[C * window * D]`` in the source as one vector.
@@ -411,7 +411,7 @@ def _places(
 
 
 def _mask(swapped: torch.Tensor, leaf: SwapLeaf, ndim: int) -> torch.Tensor:
-    """Which values of a leaf are swapped, to broadcast with ``[C, window, ...]``."""
+    """Returns which values are swapped, to broadcast with ``[C, window, ...]``."""
     if isinstance(leaf.owner, int):
         return swapped[:, leaf.owner].view(-1, *(1,) * ndim)
     owner = leaf.owner.to(swapped.device).expand(swapped.shape[0], -1)

@@ -224,14 +224,14 @@ def test_pickle_and_clone() -> None:
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"window": 0}, "window is at least 1 row"),
+        ({"window": 0}, "window must be at least 1 row"),
         ({"mixture": {}}, "mixture maps strategies"),
         ({"mixture": {"first": 1.0}}, "mixture maps strategies"),
         ({"mixture": {"last": -1.0}}, "weights of mixture"),
         ({"mixture": {"last": 0.0}}, "weights of mixture"),
         ({"mixture": {"last": math.nan}}, "weights of mixture"),
-        ({"p": 0.0}, r"is in \(0, 1\]"),
-        ({"p": 1.1}, r"is in \(0, 1\]"),
+        ({"p": 0.0}, r"must be in \(0, 1\]"),
+        ({"p": 1.1}, r"must be in \(0, 1\]"),
         ({"layout": EntityLayout({"cup": [0]})}, "no goals"),
         (
             {"layout": EntityLayout.from_keys({"cup": "c"}, goal={"cup": "g"})},
@@ -246,7 +246,7 @@ def test_arguments(arguments: dict, match: str) -> None:
 
 def test_window_is_an_int() -> None:
     for window in (True, 2.0):
-        with pytest.raises(TypeError, match="window is a number of rows, an int"):
+        with pytest.raises(TypeError, match="window must be a number of rows, an int"):
             WindowGoal(LAYOUT, window)
 
 
@@ -274,7 +274,7 @@ def test_without_a_draw_or_after_the_augmentation() -> None:
 def test_windows_that_do_not_fit() -> None:
     goals = WindowGoal(LAYOUT, 3)
     storage = buffer(goals, [5, 5]).storage
-    with pytest.raises(ValueError, match="4 rows, which windows of 3"):
+    with pytest.raises(ValueError, match="4 rows, not a multiple of the window 3"):
         goals.expand(torch.arange(4), {}, storage)
     for rows in ([3, 4, 5], [0, 2, 4], [2, 1, 0]):
         with pytest.raises(ValueError, match="not consecutive rows of one traj"):

@@ -62,7 +62,7 @@ def create_fetch_push_expert(
     """Collects episodes of the scripted expert as a Minari dataset.
 
     Every episode has ``steps`` steps and is kept, successful or not: the expert of the
-    paper fails at times too (A.6.2). The log and the description of the dataset name
+    paper sometimes fails too (A.6.2). The log and the description of the dataset report
     two shares of episodes: those in which all cubes are at their goals at some step,
     which the paper calls success, and those in which they are at the end. With
     ``L = steps``, the infos contain ``"success"``, bool ``[L + 1]``, and
@@ -210,7 +210,7 @@ def create_fetch_push_random(
 
 @dataclasses.dataclass(frozen=True)
 class _Policy:
-    """What acts, and in which environment."""
+    """A policy and the settings of its environment."""
 
     name: str
     num_cubes: int

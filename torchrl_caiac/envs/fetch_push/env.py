@@ -95,9 +95,9 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
             Defaults to ``(320, 240)``.
 
     ``reset`` takes ``options`` with the keys ``"cubes"`` and ``"goals"``, positions
-    ``[n, 2]`` or ``[n, 3]``. Drawn positions keep 10 cm between the cubes, between the
-    goals, and between cubes and gripper, and no cube starts at its goal. ``reset`` and
-    ``step`` return in ``info``:
+    ``[n, 2]`` or ``[n, 3]``. Drawn cubes are at least 10 cm from each other and from
+    the gripper, drawn goals are at least 10 cm from each other, and no cube starts at
+    its goal. ``reset`` and ``step`` return in ``info``:
 
     - ``"success"``: whether all cubes are at their goals;
     - ``"cube_success"``: bool ``[n]``, which cubes are;
@@ -389,7 +389,7 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
         """Returns everything that the simulator's next steps depend on, as one vector.
 
         These are positions, velocities and the warm start of the solver. After
-        :meth:`set_simulator_state`, the same actions give the same states, bit by bit.
+        :meth:`set_simulator_state`, the same actions give the same states, bit for bit.
 
         Returns:
             NDArray: ``[S]``, float64; ``S`` is 83 for two cubes.

@@ -1,8 +1,8 @@
-"""A scripted expert for Fetch-Push without memory.
+"""A memoryless scripted expert for Fetch-Push.
 
 Its action is a function of the observation and the goal, so a policy with the same
 inputs can learn it. Demonstrations with hidden phases ("now going around the cube")
-could not be learnt from observations.
+could not be learned from observations.
 
 ``python -m torchrl_caiac.envs.fetch_push.expert --episodes 200 --action-noise 0.2``
 measures its success.
@@ -60,10 +60,11 @@ class FetchPushExpert:
     It chooses a cube that is not at its goal: the one that it is pushing, else one with
     a free path that does not block another cube, else the one that is closest to its
     goal. It moves behind that cube (opposite to the goal), descends, and pushes along
-    the line to the goal with lateral correction. If it loses the line, it moves behind
+    the line to the goal with lateral correction. If it leaves the line, it moves behind
     the cube again. Since cubes slide, it brakes before the goal. When all cubes are at
     their goals, it moves up and waits. Cubes that block each other may be pushed back
-    and forth for long: this is rare with two cubes and costs some episodes with three.
+    and forth for a long time: this is rare with two cubes and costs some episodes with
+    three.
 
     Why episodes have 100 steps: the median episode with two cubes takes 30 steps, and
     37 with the noise of the data (0.2). But of 200 episodes with noise, 36 take more
@@ -178,7 +179,7 @@ class FetchPushExpert:
         limit = np.where(pushing, _DONE_PUSHED, _DONE_LEFT)
         todo: NDArray[np.bool_] = np.asarray(_norm(way - slide) > limit)
 
-        # Metres, and one for each obstacle.
+        # In metres, plus one for each obstacle.
         cost = distance - 2.0 * pushing
         target = goals[..., :2]
         # [R, i, j]: does cube j block the path of cube i; does the goal of i block j?

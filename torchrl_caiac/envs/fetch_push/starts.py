@@ -1,4 +1,4 @@
-"""Where the cubes and their goals are when an episode starts."""
+"""The start positions of the cubes, and their goals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _REACH = (0.40, 0.87)
 _SEPARATION = 0.1
 _DIAGONAL = 2 * np.sqrt(2) * CUBE_HALF
 _MAX_DRAWS = 200
-# Positions keep this distance to the edges of the table.
+# The minimum distance of positions from the edges of the table.
 _MARGIN = 0.05
 
 
@@ -36,7 +36,7 @@ class Region:
         name (str): what is drawn, ``"cubes"`` or ``"goals"``.
         num_cubes (int): the number of cubes ``n``.
         half (float): half the side of the square, in metres.
-        distance_threshold (float): the distance that a cube keeps to its own goal, in
+        distance_threshold (float): a cube is farther than this from its own goal, in
             metres.
 
     Raises:
@@ -76,16 +76,17 @@ class Region:
         away_from: Sequence[NDArray[np.float64]] = (),
         own: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Draws positions with 10 cm between them.
+        """Draws positions that are at least 10 cm apart.
 
         Args:
             rng (np.random.Generator): the source of random numbers.
 
         Keyword Args:
-            away_from (sequence of NDArray, optional): positions ``[2]`` to which all
-                keep 10 cm, such as that of the gripper.
-            own (NDArray, optional): positions ``[n, 3]``: a drawn cube keeps
-                ``distance_threshold`` to its own goal, and a drawn goal to its cube.
+            away_from (sequence of NDArray, optional): positions ``[2]`` that are at
+                least 10 cm from all drawn ones, such as that of the gripper.
+            own (NDArray, optional): positions ``[n, 3]``: a drawn cube is farther than
+                ``distance_threshold`` from its own goal, and a drawn goal from its
+                cube.
 
         Returns:
             NDArray: positions ``[n, 3]``, at the height of a resting cube.
@@ -122,7 +123,7 @@ class Region:
 def check_positions(
     name: str, positions: ArrayLike, num_cubes: int, *, height_tolerance: float
 ) -> NDArray[np.float64]:
-    """Checks positions that a user gave.
+    """Checks given positions.
 
     Args:
         name (str): what they are, ``"cubes"`` or ``"goals"``.

@@ -1,4 +1,4 @@
-"""What a Fetch-Push task is: entities, distances to the goals, reward."""
+"""The Fetch-Push task: entities, distances to the goals, and reward."""
 
 from __future__ import annotations
 

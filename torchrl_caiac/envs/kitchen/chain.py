@@ -25,7 +25,7 @@ class KitchenChain:
     Each attempt plays the task's table until its object is well within the success
     threshold, or within it and moving away from its goal again, then retreats. The next
     task is the first in the order that is not solved and has attempts left: a failed
-    task is tried again at once, one that was undone later is repaired. Tasks that are
+    task is repeated at once, and so is a task that was undone later. Tasks that are
     already solved are skipped.
 
     Args:
@@ -221,7 +221,8 @@ def random_chain_start(
     See :meth:`~torchrl_caiac.envs.KitchenEnv.random_start` for a single task.
 
     Args:
-        kitchen (KitchenEnv): the environment that draws; the chain may act in another.
+        kitchen (KitchenEnv): the environment in which the start is drawn; the chain may
+            act in another.
         tasks (sequence of str): names in
             :data:`~torchrl_caiac.envs.kitchen.waypoints.TASKS`, whose objects keep
             their default configuration.

@@ -301,8 +301,8 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
             )
         super().reset(seed=seed)
         if seed is not None:
-            # The noise gets the stream that upstream's noise gets; starts and tasks get
-            # one far ahead of it.
+            # The noise has the same random stream as upstream; starts and tasks have a
+            # stream far ahead of it.
             bits: Any = self.np_random.bit_generator
             self.np_random = np.random.Generator(bits.jumped())
         task = options.get("task", self._task_option)
@@ -385,7 +385,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         return kitchen_reward(achieved, desired, info, threshold=self.threshold)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Renders the current state without shadows and reflections, which cost 10x.
+        """Renders the current state without shadows and reflections, which are slow.
 
         Returns:
             numpy.ndarray: RGB frame ``[height, width, 3]``; ``None`` without a render

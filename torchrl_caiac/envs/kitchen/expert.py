@@ -109,9 +109,9 @@ class KitchenExpert:
             axis, drawn once in each episode. Defaults to 0.005.
         action_noise (float): standard deviation of the noise on every action.
             Defaults to 0.03.
-        clearance (float, optional): a ``"reach"`` that would bring the arm nearer than
-            this to something, metres, takes a detour by the posture of another task if
-            that keeps more distance. Defaults to ``None``: the arm always goes
+        clearance (float, optional): a ``"reach"`` that would move the arm closer than
+            this to something, metres, takes a detour through the posture of another
+            task if that keeps more distance. Defaults to ``None``: the arm always goes
             straight, which suits a start from the default posture.
         rng (numpy.random.Generator or int, optional): generator of all draws, or its
             seed.
@@ -377,7 +377,7 @@ class KitchenExpert:
         if waypoint.move == "hold":
             return target, rotation
         # A point on the line, one step past the tool's projection: errors across the
-        # line are corrected, and the target never runs away from a slow arm.
+        # line are corrected, and the target never moves far ahead of a slow arm.
         line = target - self._begin
         length = max(float(np.linalg.norm(line)), 1e-9)
         progress = float((point - self._begin) @ line) / length + reach

@@ -289,7 +289,7 @@ class InverseKinematics:
         iterations: int = 60,
         tolerance: float = 5e-3,
     ) -> NDArray[np.float64]:
-        """Searches a configuration that reaches a pose without touching anything.
+        """Searches for a configuration that reaches a pose without touching anything.
 
         Solves from random joint positions. Of the solutions without contacts, the one
         whose largest change from ``near`` is smallest is returned.

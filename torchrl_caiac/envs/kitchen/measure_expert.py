@@ -86,7 +86,7 @@ def _measure_task(env: Any, name: str, options: argparse.Namespace) -> int:
     done = [length for length in lengths if length]
     largest = np.max(moved, axis=0)
     _logger.info(
-        "%s: %d of %d episodes, steps %d to %d (median %d), %.2f s an episode; object "
+        "%s: %d of %d episodes, steps %d to %d (median %d), %.2f s per episode; object "
         "at the end %s (median), others moved by at most %.4f (position %d)",
         name,
         len(done),
@@ -163,7 +163,7 @@ def _measure_chains(env: Any, options: argparse.Namespace) -> int:
     done = [length for length in lengths if length]
     _logger.info(
         "chains of %d: %d of %d, in %d no other object moved by 2 cm (or 0.02 rad); "
-        "steps %d to %d (median %d), %.2f s a chain",
+        "steps %d to %d (median %d), %.2f s per chain",
         options.chain,
         len(done),
         len(lengths),

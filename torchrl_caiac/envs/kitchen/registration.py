@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["KITCHEN_ENV_ID", "make_kitchen_env", "register_kitchen"]
 
-#: The name under which gymnasium knows :class:`~torchrl_caiac.envs.KitchenEnv`.
+#: The gymnasium id of :class:`~torchrl_caiac.envs.KitchenEnv`.
 KITCHEN_ENV_ID = "torchrl_caiac/FrankaKitchen-v0"
 
 

@@ -53,7 +53,7 @@ _DIVERGED = (
 
 @functools.cache
 def _upstream() -> tuple[Any, NDArray[np.float64]]:
-    """Compiles the model once a process (0.3 s) and returns it with its start."""
+    """Compiles the model once per process (0.3 s) and returns it with its start."""
     gymnasium.register_envs(gymnasium_robotics)
     kitchen = UpstreamKitchen()
     return kitchen.model, kitchen.robot_env.init_qpos.copy()

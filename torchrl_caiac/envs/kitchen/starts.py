@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 # A random start in which two bodies overlap by more than this, in metres, is drawn
-# again. The kettle of the default start stands 1.5 mm deep in the hob.
+# again. The kettle of the default start is 1.5 mm deep in the hob.
 _MAX_OVERLAP = 4e-3
 _MAX_DRAWS = 100
 # Where a random start may put the kettle, in metres: the rectangle between the four
@@ -143,7 +143,7 @@ def random_start(
 
     The paper does not state its ranges. Here doors, knobs and the switch are uniform
     between the default and the solved configuration, and coupled joints agree with each
-    other. The kettle stands upright anywhere between the four burners (x in
+    other. The kettle is placed upright anywhere between the four burners (x in
     [-0.25, 0.22], y in [0.34, 0.78] metres). A start in which bodies overlap by more
     than 4 mm is drawn again. The robot keeps its default posture.
 
@@ -175,7 +175,7 @@ def random_start(
     for _ in range(_MAX_DRAWS):
         state = default_state()
         for name in KITCHEN_LAYOUT.names[1:]:
-            # Always drawn, so that one object's draw does not shift the next.
+            # Always drawn, so that one object's draw does not change the next.
             chosen, fraction, x, y = rng.random(4)
             if name == task or chosen >= p:
                 continue

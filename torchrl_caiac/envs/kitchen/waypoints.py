@@ -92,8 +92,8 @@ class ExpertTask:
 
     Args:
         name (str): the task's name in ``FrankaKitchen-v1``.
-        columns (tuple of int): positions of the object in ``qpos`` that its goal is
-            about.
+        columns (tuple of int): indices in ``qpos`` of the object's joints that the goal
+            describes.
         goal (tuple of float): their goal values.
         waypoints (tuple of Waypoint): the motion.
         posture (tuple of float, optional): joint positions ``[7]`` of the arm, free of

@@ -1,4 +1,4 @@
-"""Goals from the future of a trajectory: what the goals of all kinds share."""
+"""Goals from the future of a trajectory: the base of all goal transforms."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def draw_goal_offset(
     p: float = 0.3,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draws how many rows after its window the goal of each window is.
+    """Draws the number of rows from each window to its goal.
 
     Offset 0 is the window's last row, whose next state is the first one after the
     window. Three strategies are mixed, window by window: ``last`` takes the
@@ -91,7 +91,7 @@ def _geometric(
     device: torch.device,
     generator: torch.Generator | None,
 ) -> torch.Tensor:
-    """How many trials fail before one succeeds, int64."""
+    """Draws the number of failed trials before the first success, int64."""
 
     def draw(*, generator: Any, **kwargs: Any) -> torch.Tensor:
         trials = torch.empty(shape, dtype=torch.int64, **kwargs)
@@ -133,7 +133,9 @@ class FutureGoal(Transform, SampleUnit):
         super().__init__()
         check_layout(layout)
         if not 0 < p <= 1:
-            raise ValueError(f"p, of the geometric strategy, is in (0, 1], got {p!r}")
+            raise ValueError(
+                f"p, of the geometric strategy, must be in (0, 1], got {p!r}"
+            )
         if not any(layout.goal.values()):
             raise ValueError(
                 "the layout has no goals: give EntityLayout(..., goal=..., "
@@ -163,7 +165,8 @@ class FutureGoal(Transform, SampleUnit):
         self._reset_state()
 
     def _reset_state(self) -> None:
-        # By thread: a buffer prefetches in threads, each of which draws and applies.
+        # Separate for each thread: a buffer prefetches in threads, which draw and
+        # apply.
         self._pending = threading.local()
         self._cache = TrajectoryCache(
             trajectory_key=self.keys.trajectory, done_key=self.keys.done
@@ -188,7 +191,7 @@ class FutureGoal(Transform, SampleUnit):
         """Returns the data of the buffer's storage, and its trajectories.
 
         Args:
-            storage (TensorStorage): what is sampled.
+            storage (TensorStorage): the sampled storage.
 
         Returns:
             tuple: the storage's own tensordict, and the index.
@@ -276,7 +279,7 @@ class FutureGoal(Transform, SampleUnit):
             layout order.
 
         Raises:
-            KeyError: the data lacks the leaf that goals are read from.
+            KeyError: the data lack the leaf that goals are read from.
         """
         layout = self.layout
         if layout.is_flat:
@@ -308,7 +311,7 @@ class FutureGoal(Transform, SampleUnit):
         return f"{type(self).__name__}({self.extra_repr()})"
 
     def clone(self) -> FutureGoal:
-        """A copy with its own pending goals."""
+        """Returns a copy with its own pending goals."""
         clone: FutureGoal = super().clone()
         clone._reset_state()
         return clone

@@ -23,7 +23,7 @@ Goals = dict[NestedKey, torch.Tensor]
 
 
 class HindsightDraw(NamedTuple):
-    """What was drawn for one batch of ``B`` rows: where each desired goal comes from.
+    """The draw for one batch of ``B`` rows: the source of each desired goal.
 
     Attributes:
         source (torch.Tensor): int64 ``[B]``. Below ``B``: the row's own desired goal;
@@ -53,12 +53,12 @@ class HindsightGoal(FutureGoal):
     :class:`~torchrl_caiac.CAIACTransform` needs no ``reward_fn`` of its own. End flags
     stay as they were stored: this is meant for tasks that do not end at their goal.
 
-    Append it after the augmentation. Before it, the augmentation raises.
+    Append it after the augmentation; in the other order the augmentation raises.
 
-    Where ``future`` is not 0, pass the same object to the buffer as ``sample_unit``: it
-    sees the sampled rows there, and draws goals from the storage. Where it is 0 the
-    batch is enough, and a :class:`~torchrl.data.HERReplayBuffer` can relabel the real
-    transitions, see :meth:`her_reward`.
+    If ``future`` is not 0, pass the same object to the buffer as ``sample_unit``, so
+    that it receives the sampled rows and draws goals from the storage. If it is 0, all
+    goals come from the batch, and a :class:`~torchrl.data.HERReplayBuffer` can relabel
+    the real transitions, see :meth:`her_reward`.
 
     The paper's methods, with half of each batch counterfactual:
 
@@ -80,8 +80,8 @@ class HindsightGoal(FutureGoal):
     Keyword Args:
         future (float): share of real transitions with a goal of their future. Defaults
             to 0.5.
-        random (float): share of real transitions with a goal of another one;
-            ``future`` and ``random`` are at most 1 together. Defaults to 0.
+        random (float): share of real transitions with a goal of another one; the sum of
+            ``future`` and ``random`` is at most 1. Defaults to 0.
         counterfactual (float): share of counterfactual transitions with a goal of
             counterfactual ones. Defaults to 0.5.
         strategy (str): how future goals are drawn. ``"geometric"``: the state
@@ -143,15 +143,17 @@ class HindsightGoal(FutureGoal):
     ) -> None:
         super().__init__(layout, p=p, generator=generator, keys=keys)
         if strategy not in ("geometric", "uniform"):
-            raise ValueError(f"strategy is 'geometric' or 'uniform', got {strategy!r}")
+            raise ValueError(
+                f"strategy must be 'geometric' or 'uniform', got {strategy!r}"
+            )
         self.reward_fn = check_reward_fn(reward_fn)
         self.future = check_number("future", future, 1.0)
         self.random = check_number("random", random, 1.0)
         self.counterfactual = check_number("counterfactual", counterfactual, 1.0)
         if self.future + self.random > 1.0:
             raise ValueError(
-                "future and random are shares of the real rows, at most 1 together; "
-                f"got {future!r} and {random!r}"
+                "future and random are shares of the real rows, with a sum of at most "
+                f"1; got {future!r} and {random!r}"
             )
         self.strategy = strategy
         self.in_keys = [
@@ -170,12 +172,12 @@ class HindsightGoal(FutureGoal):
         info: dict[str, Any],
         storage: Any,
     ) -> tuple[torch.Tensor | tuple[torch.Tensor, ...], dict[str, Any]]:
-        """Draws and reads a future goal for each sampled row; the rows stay.
+        """Draws and reads a future goal for each sampled row.
 
         Args:
             index (torch.Tensor): the sampled rows ``[B]``.
             info (dict): the sampler's information, returned as it is.
-            storage (TensorStorage): what is sampled.
+            storage (TensorStorage): the sampled storage.
 
         Returns:
             tuple: ``index`` and ``info``.
@@ -201,7 +203,7 @@ class HindsightGoal(FutureGoal):
         future: Mapping[NestedKey, torch.Tensor] | None = None,
         generator: torch.Generator | None = None,
     ) -> HindsightDraw:
-        """Draws which rows are relabelled, and from where.
+        """Draws which rows are relabelled, and the sources of their goals.
 
         Args:
             counterfactual (torch.Tensor): bool ``[B, 1]``, the augmentation's flag.
@@ -225,7 +227,7 @@ class HindsightGoal(FutureGoal):
             torch.rand, (2, rows), device=device, generator=generator
         ).double()
         own = torch.arange(rows, device=device)
-        # Real rows first: each kind draws among the places that it takes up.
+        # Real rows first: each kind draws among its own places.
         order = torch.argsort(flags.byte(), stable=True)
         flagged = flags.sum()
         real = rows - flagged
@@ -259,7 +261,7 @@ class HindsightGoal(FutureGoal):
         return desired
 
     def _relabel(self, td: TensorDictBase, draw: HindsightDraw) -> Goals:
-        """The leaves that a draw changes or adds."""
+        """Returns the leaves that a draw changes or adds."""
         relabeled = (draw.source >= td.shape[0]).unsqueeze(-1)
         flags = td.get(self.keys.counterfactual, None)
         achieved = self.read_goals(td)
@@ -287,7 +289,7 @@ class HindsightGoal(FutureGoal):
         """Applies a draw: the same draw gives the same batch.
 
         Args:
-            tensordict (TensorDictBase): the batch ``[B]``; it stays as it is.
+            tensordict (TensorDictBase): the batch ``[B]``; it is not changed.
             draw (HindsightDraw): from :meth:`generate_parameters`.
 
         Returns:
@@ -310,7 +312,7 @@ class HindsightGoal(FutureGoal):
             tensordict (TensorDictBase): the batch ``[B]``.
 
         Returns:
-            TensorDictBase: a shallow copy with new leaves; the input stays as it is.
+            TensorDictBase: a shallow copy with new leaves; the input is not changed.
 
         Raises:
             RuntimeError: no future goals were drawn for this batch, or it was
@@ -342,7 +344,7 @@ class HindsightGoal(FutureGoal):
                     )
         if tensordict.get(self.keys.relabeled, None) is not None:
             raise RuntimeError(
-                f"the batch is already relabelled, as {self.keys.relabeled!r} says: "
+                f"the batch is already relabelled, see {self.keys.relabeled!r}: "
                 "append one HindsightGoal only"
             )
         flags = tensordict.get(self.keys.counterfactual, None)
@@ -358,15 +360,15 @@ class HindsightGoal(FutureGoal):
         return self.apply_parameters(tensordict, draw)
 
     def her_reward(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """The reward function for a :class:`~torchrl.data.HERReplayBuffer`.
+        """Computes the rewards for a :class:`~torchrl.data.HERReplayBuffer`.
 
         That buffer relabels the *first* ``int(her_ratio * B)`` rows of a batch after
         all transforms, from a uniformly drawn later row of the trajectory. With
         ``her_ratio`` at most ``1 - counterfactual_ratio`` these are real rows, and a
-        ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones after
-        them. The flag in :attr:`relabeled_key` is set for both. That buffer knows
-        trajectories by their end flags only, and in TorchRL 0.14 it must not be
-        written to once it is full.
+        ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones after them.
+        The flag in :attr:`relabeled_key` is set for both. That buffer identifies
+        trajectories by their end flags only, and in TorchRL 0.14 it must not be written
+        to once it is full.
 
         Args:
             tensordict (TensorDictBase): the rows that the buffer relabelled.
@@ -429,7 +431,7 @@ class HindsightGoal(FutureGoal):
         )
 
     def extra_repr(self) -> str:
-        """The arguments, for ``repr``."""
+        """Returns the arguments, for ``repr``."""
         return (
             f"future={self.future}, random={self.random}, "
             f"counterfactual={self.counterfactual}, strategy={self.strategy!r}, "

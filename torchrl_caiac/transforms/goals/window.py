@@ -24,12 +24,13 @@ _STRATEGIES = ("last", "uniform", "geometric")
 
 
 class WindowGoal(FutureGoal):
-    """Gives each window a goal: the goal achieved in a later state of its trajectory.
+    """Sets the goal of each window to that achieved in a later state of its trajectory.
 
-    Pass the same object to a replay buffer twice: as its ``sample_unit``, in which it
-    sees the sampled rows and draws a goal for each window, and as a transform, in which
-    it writes these goals into the batch, the same for all rows of a window. Append it
-    before :class:`~torchrl_caiac.CAIACTransform`, which then swaps goals with entities.
+    Pass the same object to a replay buffer twice: as its ``sample_unit``, which
+    receives the sampled rows and draws a goal for each window, and as a transform,
+    which writes these goals into the batch, the same for all rows of a window. Append
+    it before :class:`~torchrl_caiac.CAIACTransform`, which then swaps goals with
+    entities.
 
     The goal is that of the *next* state of a row (the state that is reached), so the
     last state of a trajectory can be a goal. Goals are read from ``layout.achieved``
@@ -38,7 +39,7 @@ class WindowGoal(FutureGoal):
     writes its ``goal`` leaves.
 
     :class:`~torchrl.data.SliceSampler` with ``strict_length=True`` (its default) never
-    samples trajectories shorter than ``window``, and raises if there is no longer one.
+    samples trajectories shorter than ``window``, and raises if all are shorter.
 
     Args:
         layout (EntityLayout): the entities and their goals.
@@ -150,27 +151,27 @@ class WindowGoal(FutureGoal):
         info: dict[str, Any],
         storage: Any,
     ) -> tuple[torch.Tensor | tuple[torch.Tensor, ...], dict[str, Any]]:
-        """Draws and reads a goal for each sampled window; the rows stay as they are.
+        """Draws and reads a goal for each sampled window.
 
         Args:
             index (torch.Tensor): the sampled rows ``[B * window]``, window by window.
             info (dict): the sampler's information, returned as it is.
-            storage (TensorStorage): what is sampled.
+            storage (TensorStorage): the sampled storage.
 
         Returns:
             tuple: ``index`` and ``info``.
 
         Raises:
             ValueError: the rows do not make up windows within trajectories. On a CUDA
-                device this comes with a later sample, so that none is waited for.
+                device it is raised at a later sample, so that none waits.
         """
         rows = index[0] if isinstance(index, tuple) else index
         rows = rows.reshape(-1)
         if rows.shape[0] % self.window:
             raise ValueError(
-                f"the sampler drew {rows.shape[0]} rows, which windows of "
-                f"{self.window} do not divide: sample slices of this length, e.g. "
-                f"SliceSampler(slice_len={self.window}), of a batch size that is a "
+                f"the sampler drew {rows.shape[0]} rows, not a multiple of the window "
+                f"{self.window}: sample slices of this length, e.g. "
+                f"SliceSampler(slice_len={self.window}), and a batch size that is a "
                 "multiple of it"
             )
         data, trajectories = self.stored(storage)
@@ -180,7 +181,7 @@ class WindowGoal(FutureGoal):
         remaining = trajectories.remaining(first) - (self.window - 1)
         if self.window > 1:
             self._check_windows(windows, remaining, trajectories)
-        # Below zero only where an error comes late.
+        # Below zero only if an error is raised later.
         offset = draw_goal_offset(
             remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
         )
@@ -193,7 +194,7 @@ class WindowGoal(FutureGoal):
         remaining: torch.Tensor,
         trajectories: TrajectoryIndex,
     ) -> None:
-        """Raises where rows are no windows: on an accelerator, some samples later."""
+        """Raises if rows are not windows; on an accelerator, some samples later."""
         steps = torch.arange(self.window, device=windows.device)
         follow = trajectories.later(windows[:, :1], steps)
         broken = (windows != follow).any() | (remaining < 0).any()
@@ -217,7 +218,7 @@ class WindowGoal(FutureGoal):
         owner: int | torch.Tensor,
         key: NestedKey,
     ) -> torch.Tensor:
-        """Reads the goals that entities take over from donor windows.
+        """Reads the goals that entities get from donor windows.
 
         Args:
             donors (TensorDictBase): the donors' data, ``[T]``.
@@ -289,7 +290,7 @@ class WindowGoal(FutureGoal):
         return out
 
     def extra_repr(self) -> str:
-        """The arguments, for ``repr``."""
+        """Returns the arguments, for ``repr``."""
         return f"window={self.window}, mixture={self.mixture}, p={self.p}"
 
 

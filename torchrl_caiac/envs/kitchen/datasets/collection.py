@@ -65,7 +65,7 @@ def make_franka_kitchen(tasks: Sequence[str]) -> Any:
     return gymnasium.make(
         "FrankaKitchen-v1",
         tasks_to_complete=list(tasks),
-        # Whole motions, and rewards that do not depend on what happened before.
+        # Complete motions, and rewards that do not depend on earlier steps.
         terminate_on_tasks_completed=False,
         remove_task_when_completed=False,
         # As in Minari's datasets: chains take longer than the 280 of an evaluation.

@@ -114,7 +114,7 @@ def create_kitchen_demonstrations(
 
     Raises:
         FileExistsError: the dataset exists and ``overwrite`` is ``False``.
-        KeyError: the expert does not know a task.
+        KeyError: the expert has no table for a task.
         ValueError: no demonstrations were requested.
 
     Examples:

@@ -29,8 +29,8 @@ __all__ = ["PLAY_ID", "PLAY_ORDERS", "create_kitchen_play"]
 PLAY_ID = "kitchen/play-v0"
 #: Orders of tasks like those of D4RL's mixed and partial kitchens: an early task comes
 #: first, and most combinations of done and open tasks never occur. Every task is
-#: followed by another in some order: counterfactuals show an object's final place only
-#: where it rests while something else is done.
+#: followed by another in some order: counterfactuals show an object in its final
+#: position only if it rests there during another task.
 PLAY_ORDERS = (
     ("microwave", "kettle", "top burner", "light switch"),
     ("microwave", "kettle", "hinge cabinet", "slide cabinet"),
@@ -98,7 +98,7 @@ def create_kitchen_play(
 
     Raises:
         FileExistsError: the dataset exists and ``overwrite`` is ``False``.
-        KeyError: the expert does not know a task.
+        KeyError: the expert has no table for a task.
         ValueError: no episodes were requested, an order repeats a task, or the speeds
             are not in order.
 

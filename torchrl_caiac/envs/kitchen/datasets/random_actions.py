@@ -203,7 +203,7 @@ def _random_buffers(file: Path) -> Iterator[EpisodeBuffer]:
 
 
 def _simulator_states(dataset: MinariDataset) -> NDArray[np.float64]:
-    """Returns positions and velocities `[M, 59]` of all states that have an action."""
+    """Returns positions and velocities ``[M, 59]`` of all states with an action."""
     states = []
     for episode in dataset.iterate_episodes():
         infos = episode.infos or {}
