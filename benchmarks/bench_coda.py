@@ -3,9 +3,9 @@
 Run with ``pytest benchmarks/bench_coda.py`` (``make bench``). The batches are those of
 ``bench_sampling.py``: 512 transitions of Fetch-Push (3 entities) and 500 windows of 20
 rows of the kitchen (10 entities), donors from the batch or from 100 k stored rows; the
-transforms are timed alone, without sampling, on the same batch. With
-``--device=cuda`` batches and donors lie on the GPU. For scoring, the rate is that of
-the attention against the model's plain forward pass, in chunks of the same size.
+transforms are timed alone, without sampling, on the same batch. With ``--device=cuda``
+batches and donors are on the GPU. For scoring, the rate is that of the attention
+against the model's plain forward pass, in chunks of the same size.
 """
 
 from __future__ import annotations

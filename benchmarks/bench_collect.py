@@ -1,4 +1,4 @@
-"""Fetch-Push episodes a second with one and with two processes, and how busy they are.
+"""Fetch-Push episodes per second with one and two processes, and their busy share.
 
 Run with ``pytest benchmarks/bench_collect.py`` (``make bench``). What is timed is
 ``create_fetch_push_expert`` as ``examples/environments/fetch_push.py`` calls it:
@@ -21,14 +21,14 @@ EPISODES = 300
 
 
 def processor_time() -> float:
-    """Seconds of this process and of those it waited for."""
+    """Returns the processor time of this process and of those it waited for."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def bench_expert(benchmark, judge, tmp_path: Path, workers: int):
-    """A dataset made anew, once."""
+    """Collects a dataset from scratch, once."""
     busy = []
 
     def collect() -> None:

@@ -1,14 +1,14 @@
 """Milliseconds of an LMP gradient step, and the share of sampling and swapping.
 
 Run with ``pytest benchmarks/bench_lmp.py`` (``make bench``). The data have the
-kitchen's shapes: 100 demonstrations of 60 steps, 30 state columns, 10 entities of
-which the robot is never swapped, 21 goal columns. ``extra_info`` of the last
-benchmark holds the share of the step that goes to ``rb.sample()``. With
-``--device=cuda`` the storage lies on the device, too.
+kitchen's shapes: 100 demonstrations of 60 steps, 30 state columns, 10 entities of which
+the robot is never swapped, 21 goal columns. ``extra_info`` of the last benchmark
+contains the share of ``rb.sample()`` in the step. With ``--device=cuda`` the storage is
+on the device, too.
 
-The step is judged beside a bare one: the same modules called on plain tensors, the
-squared error and the KL divergence written out, no tensordict, no checks. Both end
-with the backward pass; the optimizer, alike on both sides, is left out.
+The step is compared with a bare one: the same modules called on plain tensors, the
+squared error and the KL divergence written out, no tensordict, no checks. Both end with
+the backward pass; the optimizer, the same on both sides, is left out.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def make_step(window: int, device: torch.device) -> Callable[[TensorDict], None]
 
 
 def wait(device: torch.device) -> None:
-    """Until the device has done what it was told."""
+    """Waits until the device has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -132,7 +132,7 @@ def bare_pass(
 
 @SIZES
 def test_gradient_step(benchmark, device, windows, window):
-    """The step alone, on a batch that is there."""
+    """The step alone, on an existing batch."""
     batch = make_buffer(windows, window, device, swap=True).sample()
     step = make_step(window, device)
     benchmark.pedantic(step, args=(batch,), rounds=20, warmup_rounds=3)

@@ -8,9 +8,9 @@ largest storage takes 4 GB of disk or memory. The example samples four batches o
 transitions at once, which is timed too. With ``--device=cuda`` there are storages
 on the GPU too; samples of the others are moved there before all transforms.
 
-A ratio is to the same sample without the transform, all timed in turns. One ratio has
-another divisor: 4,900 windows a second, the rate of the authors' sampler, is a figure
-from another machine of ours.
+Ratios are to the same sample without the transform, all timed in turns. One ratio has
+another divisor: 4,900 windows per second, the rate of the authors' sampler, measured on
+another machine of ours.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ KITCHEN = EntityLayout(
     fixed=("robot",),
 )
 ROWS = {"10k": 10_000, "1M": 1_000_000, "10M": 10_000_000}
-# Layout, columns, action, whether there are goals in the storage, rows a window.
+# Layout, columns, action, whether there are goals in the storage, rows per window.
 TRANSITIONS = (FETCH, 34, 4, True, 1)
 WINDOWS = (KITCHEN, 30, 9, False, 20)
 
@@ -67,7 +67,7 @@ class Setting:
     sampler: dict[str, Any] = field(default_factory=dict)
 
     def buffer(self, *transforms: Any, unit: Any = None) -> ReplayBuffer:
-        """A buffer over the storage; its samples lie on the device."""
+        """Returns a buffer over the storage; its samples are on the device."""
         sampler = None
         on_device = torch.device(self.storage.device).type == self.device.type
         if self.window > 1:
@@ -123,7 +123,7 @@ def sparse_reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor
 
 
 def chunk(layout: EntityLayout, width: int, action: int, goals: bool) -> TensorDict:
-    """One chunk of data, that fills a storage by being repeated."""
+    """Returns one chunk of data, which is repeated to fill a storage."""
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape: int) -> torch.Tensor:
@@ -176,14 +176,14 @@ def settled_memory() -> None:
     """Frees one large block, as any training step does.
 
     Up to the size of the largest block that was freed, malloc keeps memory for later.
-    Before, it is chance whether a sample of a few MB has all of its pages made anew.
+    Before that, it depends on chance whether a sample of a few MB needs new pages.
     """
     torch.empty(31 << 20, dtype=torch.uint8)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
-    """A folder that goes with the benchmark: gigabytes, not to be kept."""
+    """Yields a folder that is deleted after the benchmark: it has gigabytes."""
     yield tmp_path
     shutil.rmtree(tmp_path, ignore_errors=True)
 
@@ -204,7 +204,7 @@ def made(
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Storages on the GPU are measured where samples are wanted there."""
+    """Storages on the GPU are measured if samples are needed there."""
     if "kind" in metafunc.fixturenames:
         on_gpu = metafunc.config.getoption("--device") == "cuda"
         metafunc.parametrize("kind", ["memory", "memmap", *["cuda"] * on_gpu])
@@ -262,9 +262,9 @@ def bench_growth(
 ) -> None:
     """From 10 k to 10 M rows, read in three ways.
 
-    A plain sample grows too, by the rows that are no longer in a cache. What the
-    transform adds to a sample includes that its tensors drive such rows out, and so it
-    is timed alone as well, on batches just drawn.
+    A plain sample grows too, by the rows that are no longer in a cache. The time that
+    the transform adds to a sample includes the eviction of such rows by its tensors, so
+    it is timed alone as well, on batches just drawn.
     """
     settings = {
         rows: made(
@@ -322,7 +322,7 @@ def on_fresh_batches(
 def bench_memory(
     benchmark: Any, judge: Any, shape: str, folder: Path, device: torch.device
 ) -> None:
-    """The most memory that a sample takes at a time, the batch included."""
+    """The peak memory of a sample, including the batch."""
     kind = "memory" if device.type == "cpu" else "cuda"
     setting = (
         made(TRANSITIONS, 512, "10k", kind, folder, device)
@@ -341,7 +341,7 @@ def bench_memory(
 
 
 def peak(call: Callable[[], Any]) -> int:
-    """The bytes of tensors that a call has alive at most."""
+    """Returns the peak size in bytes of the live tensors of a call."""
     if torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()

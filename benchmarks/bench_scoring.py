@@ -3,11 +3,11 @@
 Run with ``pytest benchmarks/bench_scoring.py`` (``make bench``). Both shapes have 64
 actions: Fetch-Push with two cubes (34 columns and 4 actions, 3 x 256, 11 predicted
 columns of 3 entities) and the kitchen (30 and 9, 5 x 256, all columns of 10 entities).
-How near to the threshold states are decides how fast the fast mode is, so the states
-are real: a few episodes of the scripted experts and of random actions, which the models
-are fitted to first (about a minute a shape).
+The speed of the fast mode depends on how many states are near the threshold, so the
+states are real: a few episodes of the scripted experts and of random actions, which the
+models are fitted to first (about a minute for each).
 
-The reference is eq. 3 as one would write it down, with all ``[B, K, K, d]`` tensors in
+The reference is a direct implementation of eq. 3, with all ``[B, K, K, d]`` tensors in
 memory, in float32 and for 256 states at once. In parts of 32 states, which stay in the
 cache, it is up to twice as fast: ``reference_of_32_states_per_s``. "Network" is the
 plain forward pass of the same rows of states and actions, in such small parts.
@@ -66,7 +66,7 @@ class Shape:
     smoothing: int
 
     def some(self, count: int, device: torch.device) -> TensorDict:
-        """States spread over all, again from the start where there are too few."""
+        """Returns states spread over all, repeated if there are too few."""
         order = torch.linspace(0, len(self.states) - 1, min(count, len(self.states)))
         rows = order.long().repeat(math.ceil(count / len(order)))[:count]
         states = TensorDict({"observation": self.states[rows]}, [count])
@@ -119,7 +119,7 @@ def fitted(name: str) -> Shape:
 
 
 def divergences(loc: torch.Tensor, var: torch.Tensor) -> torch.Tensor:
-    """Eq. 3 of Gaussians ``[B, K, d]``, written down."""
+    """Computes eq. 3 of Gaussians ``[B, K, d]`` directly."""
     log_k = math.log(loc.shape[1])
     loc_i, loc_k = loc[:, :, None], loc[:, None]
     var_i, var_k = var[:, :, None], var[:, None]
@@ -327,7 +327,7 @@ def bench_memory(
 
 
 def bench_growth(benchmark: Any, judge: Callable[..., None], tmp_path: Path) -> None:
-    """Rows of a memmap, by a small model: what grows is what goes with the rows."""
+    """Rows of a memmap, with a small model: the cost per row must not grow."""
     layout = EntityLayout({"arm": range(2), "cup": range(2, 4)})
     estimator = CAI(GaussianWorldModel(layout, 2, (16,)), 8, compile=True)
     micros = {}

@@ -9,18 +9,18 @@ targets; networks of 3 x 256 read 52 numbers (and the critics 4 of the action); 
 
 - Stable-Baselines3: ``TD3("MultiInputPolicy")`` with ``HerReplayBuffer``, half of the
   goals from the future of their own episode; what is timed is ``train()``. Its
-  observation holds the 34 state columns and the 6 of the cubes relative to the
-  gripper, beside achieved and desired goals of 6 each.
-- Ours: :class:`GoalConditionedTD3Loss` as ``examples/learners/td3.py`` uses it,
-  with half of the rows counterfactual (``CAIACTransform``), goals relabelled and
-  rewards made anew (``HindsightGoal``), the relative features (12 columns)
-  computed in every pass; four batches are sampled at once.
+  observation contains the 34 state columns and 6 of the cubes relative to the gripper,
+  and achieved and desired goals of 6 each.
+- Ours: :class:`GoalConditionedTD3Loss` as ``examples/learners/td3.py`` uses it, with
+  half of the rows counterfactual (``CAIACTransform``), goals relabelled and rewards
+  recomputed (``HindsightGoal``), the relative features (12 columns) computed in every
+  pass; four batches are sampled at once.
 
 Stable-Baselines3 has no setting for bfloat16. Two of torch act on it from outside:
-``torch.set_float32_matmul_precision("medium")``, which allows products in bfloat16
-(a CPU without AMX takes oneDNN's float32 kernels instead, on AMD twice as quick as
-MKL's), and ``torch.autocast``, which casts the factors as our hidden layers do. There
-is a target for the former; the times of both are in ``extra_info["ms_per_step"]``.
+``torch.set_float32_matmul_precision("medium")``, which allows products in bfloat16 (a
+CPU without AMX takes oneDNN's float32 kernels instead, on AMD twice as fast as MKL's),
+and ``torch.autocast``, which casts the factors as our hidden layers do. There is a
+target for the former; the times of both are in ``extra_info["ms_per_step"]``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from torchrl_caiac.transforms import CAIACTransform, HindsightGoal
 
 EPISODES, LENGTH, BATCH = 200, 100, 512
 STEPS = 32  # of one side before it is the turn of the next, all code then in cache
-AT_ONCE = 4  # batches, which take little more time to sample than one
+AT_ONCE = 4  # batches, which take little more time to sample than a single one
 
 
 class Goals(gym.Env):
@@ -140,7 +140,7 @@ def stable_baselines(data: TensorDict, device: torch.device) -> Any:
 
 
 def make_buffer(data: TensorDict) -> TensorDictReplayBuffer:
-    """Our buffer, as the arm ``caiac`` of the example makes it."""
+    """Creates our buffer, as the method ``caiac`` of the example does."""
     goals = HindsightGoal(LAYOUT, fetch_push_reward)
     rb = offline_buffer(data, batch_size=AT_ONCE * BATCH, sample_unit=goals)
     rb.append_transform(CAIACTransform(LAYOUT, threshold=0.05))
@@ -179,7 +179,7 @@ def bench_step(benchmark, judge, device, sides):
             theirs()
 
     def autocast() -> None:
-        # Cached casts of weights outlive the optimizer's steps: nothing is learnt.
+        # Cached casts of weights outlive the optimizer's steps: nothing is learned.
         with torch.autocast(device.type, torch.bfloat16, cache_enabled=False):
             theirs()
 

@@ -4,7 +4,7 @@ Run with ``pytest benchmarks/bench_td3.py`` (``make bench``). The shapes are tho
 Fetch-Push with two cubes: 34 state columns, 6 of the goal and 12 relative features, 4
 actions, networks of 3 x 256, two critics. A round of ``bench_step`` is two critic
 updates, one update of the policy and of the targets (policy delay 2), so ``extra_info``
-holds ``ms_per_step``, half of the fastest round.
+contains ``ms_per_step``, half of the fastest round.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ DTYPE = pytest.mark.parametrize(
 
 
 def make_batch(rows: int, device: torch.device) -> TensorDict:
-    """Transitions as a relabelling buffer gives them."""
+    """Transitions as a relabelling buffer returns them."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(width: int) -> torch.Tensor:
@@ -113,7 +113,7 @@ class Learner:
 
 
 def measure(benchmark, function: Callable[[TensorDict], None], batch: TensorDict):
-    """The fastest of 50 rounds, other jobs may run."""
+    """Measures the fastest of 50 rounds, since other jobs may run."""
     benchmark.pedantic(function, args=(batch,), rounds=50, warmup_rounds=5)
 
 

@@ -34,7 +34,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """One thread, denormals flushed: what the scripts do."""
+    """Uses one thread and flushes denormal numbers, as the scripts do."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -45,7 +45,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def no_old_objects() -> Iterator[None]:
-    """Spares the garbage collector what earlier benchmarks have left."""
+    """Excludes the objects of earlier benchmarks from garbage collection."""
     gc.collect()
     gc.freeze()
     yield
@@ -56,7 +56,7 @@ def no_old_objects() -> Iterator[None]:
 def judge(benchmark: Any, request: pytest.FixtureRequest) -> Callable[..., None]:
     """Reports a ratio and its target: ``judge(name, value, at_most=1.6)``.
 
-    The ratios are listed after the run, and kept with the benchmark's other figures.
+    The ratios are listed after the run, and saved with the benchmark's other figures.
     """
 
     def judge(
@@ -81,7 +81,7 @@ def judge(benchmark: Any, request: pytest.FixtureRequest) -> Callable[..., None]
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Lists the ratios, their targets, and whether they hold."""
+    """Lists the ratios, their targets, and whether they are met."""
     lines = [str(one) for one in config.stash.get(_JUDGED, [])]
     if lines:
         terminalreporter.section("ratios and their targets")

@@ -1,4 +1,4 @@
-"""Times calls in turns, and judges their ratios by targets."""
+"""Times calls in turns, and compares their ratios with targets."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ def seconds(
 ) -> dict[str, float]:
     """The median seconds of each call.
 
-    All calls of a round follow each other, so that what else the machine does meets
-    them alike.
+    All calls of a round follow each other, so that other load affects them equally.
     """
     times: dict[str, list[float]] = {name: [] for name in calls}
     for number in range(warmup + rounds):
@@ -33,7 +32,7 @@ def seconds(
 
 @dataclass(frozen=True)
 class Judged:
-    """A ratio beside its target."""
+    """A ratio and its target."""
 
     name: str
     value: float

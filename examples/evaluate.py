@@ -1,4 +1,4 @@
-"""Plays the kept policies of a run.
+"""Evaluates the saved policies of a run.
 
 Run after ``train.py``: ``python evaluate.py method=caiac seed=0``.
 """
@@ -23,10 +23,9 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
-    """Evaluates the kept policies of one run.
+    """Evaluates the saved policies of one run.
 
-    The results of its episodes are kept in ``evaluation/<step>.json``, and not played
-    again.
+    The results are saved in ``evaluation/<step>.json``; existing ones are not repeated.
     """
     environment = make_environment(cfg)
     folder = run_folder(cfg, method, seed) / "evaluation"

@@ -29,7 +29,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def make_scoring(cfg: DictConfig) -> Scoring:
-    """Returns what methods make their estimators of."""
+    """Returns the inputs of the methods' estimators."""
     return Scoring(
         make_environment(cfg), partial(fit_model, cfg), cfg.env.score, progress()
     )
@@ -65,7 +65,7 @@ def score(cfg: DictConfig) -> dict[str, Any]:
             estimator,
             batch_size=settings.batch_size,
             smoothing=smoothing,
-            # The ground truth is of a row's own state, so are these scores.
+            # The ground truth is that of a row's own state, like these scores.
             lookahead=0,
             key=key,
             progress=scoring.progress,

@@ -68,7 +68,7 @@ def share_swapped(cfg: DictConfig, method: str) -> float:
 def result_rows(
     cfg: DictConfig, evaluations: Sequence[Evaluation]
 ) -> list[dict[str, Any]]:
-    """Returns the table of results, one or several rows a policy."""
+    """Returns the table of results, one or several rows per policy."""
     environment = make_environment(cfg)
     return [
         {

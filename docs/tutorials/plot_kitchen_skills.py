@@ -271,7 +271,7 @@ for name, counterfactual in (("without", False), ("with", True)):
 # Evaluation
 # ----------
 # All episodes start with everything closed and differ in the noise of the simulator. An
-# episode ends with success when *all* objects are where the goal wants them, and
+# episode ends with success when *all* objects are where the goal requires, and
 # without success after 280 steps.
 
 EPISODES = 5
@@ -316,7 +316,6 @@ except RenderingUnavailable as error:
 kitchen.close()
 figure
 
-# %%
-# A few episodes of one short training are an illustration, not a measurement: with
+# %% A few episodes of one short training are an illustration, not a measurement: with
 # another seed a task may fail. ``make demo`` has more demonstrations, twice the
-# gradient steps with twice the windows, two seeds, and 20 episodes a task.
+# gradient steps with twice the windows, two seeds, and 20 episodes per task.

@@ -1,4 +1,4 @@
-"""What an environment is to the steps."""
+"""The base class of environments."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Evaluation(NamedTuple):
         method (str): the name of the method.
         seed (int): of the run.
         step (int): gradient steps of the policy.
-        fraction (float): of the data that the run learnt from.
-        episodes (list of dict): one dictionary an episode, as
+        fraction (float): of the data that the run was trained on.
+        episodes (list of dict): one dictionary for each episode, as
             :meth:`Environment.play` returns them.
     """
 
@@ -41,7 +41,7 @@ class Environment(ABC):
     """Data, simulator and evaluation of an environment.
 
     A subclass in a module of this folder, with a file ``conf/env/<name>.yaml`` that has
-    its settings, is all that a new environment takes.
+    its settings, is all that a new environment needs.
 
     Args:
         settings (DictConfig): ``cfg.env``.
@@ -56,13 +56,13 @@ class Environment(ABC):
     predicted: Mapping[str, Sequence[int]] | None = None
     """The columns that world models predict; ``None`` for all."""
     goal_reference: str | None = None
-    """The entity that networks see positions relative to; ``None`` for none."""
+    """The entity that positions are given relative to; ``None`` for none."""
     reward_fn: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None
     """Rewards of achieved and desired goals, -1 or 0; ``None`` where it has none."""
     data_name: ClassVar[str] = "data"
-    """What the data are, for the list of stages."""
+    """The name of the data in the list of stages."""
     success_key: ClassVar[str] = "success"
-    """What counts as the success of an episode, see :meth:`play`."""
+    """The entry that defines the success of an episode, see :meth:`play`."""
 
     def __init__(self, settings: DictConfig, out: Path, *, workers: int = 1) -> None:
         self.settings = settings
@@ -71,7 +71,7 @@ class Environment(ABC):
 
     @property
     def folder(self) -> Path:
-        """The folder of all that depends on the data to learn from."""
+        """The folder of everything that depends on the training data."""
         return self.out
 
     @abstractmethod
@@ -91,19 +91,19 @@ class Environment(ABC):
         return [self.rows()]
 
     def held_out(self) -> TensorDictBase:
-        """Returns transitions that nothing learns from, to check the scores."""
+        """Returns transitions that are not trained on, to check the scores."""
         return load_transitions(self.out / "held_out")
 
     @abstractmethod
     def simulator(self, num_actions: int) -> Any:
-        """Returns the estimator that queries the simulator, some actions a state."""
+        """Returns the estimator that queries the simulator, some actions per state."""
 
     @abstractmethod
     def distance_rule(self, *, action_only: bool) -> Any:
         """Returns the estimator that links entities which are close to each other."""
 
     def ground_truth(self, *, progress: bool = False) -> torch.Tensor:
-        """Returns what the action can move in the held-out states, bool ``[T, N]``."""
+        """Returns what the action moves in the held-out states, bool ``[T, N]``."""
         held_out = self.held_out()
         score_buffer(
             offline_buffer(held_out, batch_size=1),
@@ -125,7 +125,7 @@ class Environment(ABC):
             folder (Path): for figures of episodes, if any.
 
         Returns:
-            list of dict: one dictionary an episode, JSON values.
+            list of dict: one dictionary for each episode, JSON values.
         """
 
     @abstractmethod
@@ -142,14 +142,14 @@ class Environment(ABC):
 
     @abstractmethod
     def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the answer of a study in one line."""
+        """Returns the main result of a study in one line."""
 
     def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
         """Draws figures of its own. Defaults to none.
 
         Args:
             folder (Path): where they are written.
-            name (str): of the study, with which files begin.
+            name (str): of the study, the prefix of the files.
 
         Keyword Args:
             threshold (float): θ of CAIAC.

@@ -124,7 +124,7 @@ class FetchPush(Environment):
         )
 
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns one line a policy: the shares of its episodes."""
+        """Returns one line for each policy: the shares of its episodes."""
         return [{name: _mean(evaluation, name) for name in MEASURES}]
 
     def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
@@ -176,7 +176,7 @@ class FetchPush(Environment):
 
 
 def play(actor: Any, *, episodes: int, steps: int, seed: int) -> list[dict[str, bool]]:
-    """Plays episodes at the same time, from the starts that the seed gives.
+    """Plays episodes in parallel, from the starts that the seed determines.
 
     Returns:
         list of dict: for each episode whether all cubes were at their goals at some
@@ -187,7 +187,7 @@ def play(actor: Any, *, episodes: int, steps: int, seed: int) -> list[dict[str, 
     states = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
     reached = np.zeros((steps, episodes, 2), dtype=np.bool_)
     keys = [key for key in actor.in_keys if key in states[0]]
-    # What a policy carries from step to step, a plan for example.
+    # What a policy carries from step to step, for example a plan.
     carried = TensorDict({"is_init": torch.ones(episodes, 1, dtype=torch.bool)})
     carried.batch_size = [episodes]
     for step in range(steps):

@@ -89,7 +89,7 @@ class Kitchen(Environment):
     def _demonstrate(
         self, dataset_id: str, episodes: int, seed: int, options: dict[str, Any]
     ) -> MinariDataset:
-        """Collects as many demonstrations a task, or a chain of tasks."""
+        """Collects this number of demonstrations of each task, or chain of tasks."""
         if self.settings.collect.chains:
             return create_kitchen_play(
                 dataset_id, episodes=episodes, seed=seed, **options
@@ -149,7 +149,7 @@ class Kitchen(Environment):
         return episodes
 
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns one line an episode."""
+        """Returns one line for each episode."""
         return [
             {**episode, "wrong_tasks": " ".join(episode["wrong_tasks"])}
             for episode in evaluation.episodes
@@ -253,9 +253,9 @@ class Kitchen(Environment):
 
 
 class HandleDistance:
-    """The rule of distance, by where the hand and the handles are.
+    """The rule of distance, between the hand and the handles.
 
-    Observations have joints; the simulator's kinematics tell the places.
+    Observations contain joints; positions come from the simulator's kinematics.
 
     Args:
         action_only (bool): whether to score the action's links alone.
@@ -296,7 +296,7 @@ def play_task(
     strips: int,
     folder: Path,
 ) -> list[dict[str, Any]]:
-    """Plays episodes of one task at the same time; one result an episode."""
+    """Plays episodes of one task in parallel; returns one result for each."""
     torch.manual_seed(seed)
     threads = torch.get_num_threads()
     base = SerialEnv(episodes, partial(make_kitchen_env, task, start=start))
@@ -310,9 +310,9 @@ def play_task(
     finally:
         env.close()
         # TorchRL gives torch more threads when environments close, and processes that
-        # run at the same time then wait for each other's.
+        # run in parallel then wait for each other's.
         torch.set_num_threads(threads)
-        # A kitchen has 60 MB that Python's collector does not know of.
+        # A kitchen has 60 MB that Python's garbage collector does not track.
         del env, base
         gc.collect()
     after = rollout["next"]

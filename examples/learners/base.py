@@ -1,4 +1,4 @@
-"""What a learner is to the steps."""
+"""The base class of learners."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Learner(ABC):
     """Learns a policy from the rows of an environment, augmented by a method.
 
     A subclass in a module of this folder, with a file ``conf/learner/<name>.yaml`` that
-    has its settings, is all that a new learner takes. The settings ``steps``,
+    has its settings, is all that a new learner needs. The settings ``steps``,
     ``log_every``, ``checkpoint_every``, ``keep_every`` and ``logger`` are read by
     ``train.py``.
 
@@ -60,24 +60,24 @@ class Learner(ABC):
         }
 
     def rows(self) -> TensorDictBase:
-        """Returns the rows to learn from, by default those of the environment."""
+        """Returns the training data, by default those of the environment."""
         return self.environment.rows()
 
     @abstractmethod
     def make_buffer(self, rows: TensorDictBase) -> ReplayBuffer:
-        """Makes the replay buffer: rows, the method's transform, and goals."""
+        """Creates the replay buffer: rows, the method's transform, and goals."""
 
     @abstractmethod
     def setup(self, rows: TensorDictBase, seed: int) -> None:
-        """Makes buffer, networks and optimizers.
+        """Creates buffer, networks and optimizers.
 
-        What has to be saved for a run to resume goes to ``parts``, by name, with
-        ``state_dict`` and ``load_state_dict``.
+        Everything that must be saved for a run to resume is added to ``parts``, by
+        name, with ``state_dict`` and ``load_state_dict``.
         """
 
     @abstractmethod
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields batches without end."""
+        """Yields batches endlessly."""
 
     @abstractmethod
     def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
@@ -93,7 +93,7 @@ class Learner(ABC):
 
     @abstractmethod
     def policy_state(self) -> dict[str, Any]:
-        """Returns the state of the policy, tensors alone."""
+        """Returns the state of the policy, only tensors."""
 
     @abstractmethod
     def load_policy(self, state: dict[str, Any]) -> Any:

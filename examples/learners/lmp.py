@@ -61,8 +61,9 @@ class LMP(Learner):
         self.model = self.make_model()
         goals = self.environment.layout.achieved_goal(rows, next=True)
         self.model.fit_statistics(rows, goals=goals)
-        # What rests in all demonstrations is left out: its weights would stay as they
-        # were drawn, and other values of it at test time disturb everything.
+        # Columns that are constant in all demonstrations are ignored: their weights
+        # would keep their initial values, and other values at test time would disturb
+        # the output.
         for norm, values in (
             (self.model.observation_norm, rows["observation"]),
             (self.model.goal_norm, goals),

@@ -52,7 +52,7 @@ class TD3(Learner):
         environment = self.environment
         if environment.reward_fn is None:
             raise ValueError(
-                "learner=td3 needs rewards of goals, which "
+                "learner=td3 needs rewards for goals, which "
                 f"{type(environment).__name__} does not have: set its reward_fn, or "
                 "choose another learner"
             )
@@ -88,11 +88,11 @@ class TD3(Learner):
         torch.manual_seed(seed)
         self.rb = self.make_buffer(rows)
         features = self.make_features()
-        # Before the networks are made: they copy it.
+        # Before the networks are created: they copy it.
         features.fit_statistics(
             torch.cat(list(islice(self.batches(), _STATISTICS_BATCHES)))
         )
-        torch.manual_seed(seed)  # all methods of a seed begin with the same networks
+        torch.manual_seed(seed)  # all methods of a seed start with the same networks
         self.actor = self.make_actor(features)
         self.loss_module = GoalConditionedTD3Loss(
             self.actor,
@@ -122,7 +122,7 @@ class TD3(Learner):
         self.parts = {"loss": self.loss_module, **self.optimizers}
 
     def make_features(self) -> GoalFeatures:
-        """Makes what the networks read: relative positions and goals too."""
+        """Creates the input of the networks, with relative positions and goals."""
         return GoalFeatures(
             self.environment.layout, reference=self.environment.goal_reference
         )
@@ -141,7 +141,7 @@ class TD3(Learner):
         return None if name == "float32" else getattr(torch, name)
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields batches, several of one sample, which saves time."""
+        """Yields batches, several from one sample, which saves time."""
         at_once = self.settings.batches_at_once
         while True:
             rows = self.rb.sample()

@@ -1,4 +1,4 @@
-"""What an augmentation method is to the steps."""
+"""The base class of augmentation methods."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Estimator = Callable[[TensorDictBase], torch.Tensor]
 
 @dataclass(frozen=True)
 class Scoring:
-    """What methods make their estimators of.
+    """The inputs from which methods create their estimators.
 
     Attributes:
         environment (Environment): where the data come from.
@@ -45,7 +45,7 @@ class Method(ABC):
     """An augmentation: the scores that it needs, and the transform that it appends.
 
     A subclass in a module of this folder, with a file ``conf/method/<name>.yaml`` that
-    has its arguments, is all that a new method takes.
+    has its arguments, is all that a new method needs.
     """
 
     label: ClassVar[str] = ""

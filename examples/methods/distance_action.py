@@ -1,4 +1,4 @@
-"""CAIAC with a rule of distance in the place of scores."""
+"""CAIAC with a rule of distance instead of scores."""
 
 from __future__ import annotations
 

@@ -16,10 +16,10 @@ class Oracle(CAIAC):
     """Scores of 1 where the action can move an entity, else 0.
 
     Args:
-        num_actions (int): actions that are simulated a state.
-        every (int): rows of a trajectory between two that the simulator is queried
-            about. Defaults to 1.
-        batch_size (int): rows between two savings. Defaults to 10,000.
+        num_actions (int): the number of actions simulated in each state.
+        every (int): the simulator is queried in every ``every``-th row of a trajectory.
+            Defaults to 1.
+        batch_size (int): rows between two saves. Defaults to 10,000.
         threshold (float): between 0 and 1. Defaults to 0.5.
     """
 

@@ -13,7 +13,7 @@ __all__ = ["RelabelOnly"]
 
 
 class RelabelOnly(CAIAC):
-    """Tells the effect of the swap from that of the relabelling."""
+    """Separates the effect of the swap from that of relabelling."""
 
     label = "relabelling alone"
 

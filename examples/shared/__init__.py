@@ -1,1 +1,1 @@
-"""What the steps of the examples share."""
+"""Helpers that the steps of the examples share."""

@@ -1,4 +1,4 @@
-"""What a script prints: one line a stage. Everything else goes to a log file."""
+"""The console of a script: one line per stage. All other output goes to a log file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def progress() -> bool:
 
 
 def progress_bar(**options: Any) -> tqdm:
-    """Returns a progress bar of a run, in a process of its own perhaps."""
+    """Returns a progress bar of a run, also in a separate process."""
     file: TextIO | None = None
     if not progress() and _TERMINAL in os.environ:
         file = Path("/dev/tty").open("w")  # noqa: SIM115 - closed with the process
@@ -131,7 +131,7 @@ class Console:
 def start(
     cfg: DictConfig, *, folder: Path | None = None, stages: int = 1
 ) -> Iterator[Console]:
-    """Begins a script: claims its output folder, and opens its console there.
+    """Starts a script: locks its output folder, and opens its console there.
 
     Args:
         cfg (DictConfig): the configuration.

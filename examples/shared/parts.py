@@ -1,4 +1,4 @@
-"""Environments, methods and learners, made from their configuration.
+"""Environments, methods and learners, created from their configuration.
 
 Each has a YAML file in ``conf/`` whose ``_target_`` names its class.
 """
