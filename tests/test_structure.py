@@ -12,7 +12,15 @@ import torchrl_caiac
 PACKAGE = Path(torchrl_caiac.__file__).parent
 # Each may import those before it and those of its own layer.
 LAYERS = [
-    {"_columns", "_files", "_keys", "_processes", "_random", "_torchrl"},
+    {
+        "_buffer_transform",
+        "_columns",
+        "_files",
+        "_keys",
+        "_processes",
+        "_random",
+        "_torchrl",
+    },
     {"_layout_format", "_layout_reading", "entities", "trajectories"},
     {"checkpoint", "data"},
     {"envs"},

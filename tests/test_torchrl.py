@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
+import pkgutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,6 +100,35 @@ def test_no_other_module_touches_a_private_name():
     # And the test can fail: the fence itself is full of them.
     fence_tree = trees[PACKAGE / "_torchrl.py"]
     assert len(set(touched(fence_tree, own))) >= 10
+
+
+# Private methods of base classes that subclasses override on purpose, and what Python
+# and TorchRL set on every class.
+OVERRIDDEN = {*HOOKS, "_load_from_state_dict", "_make_vmap", "_set_in_keys"}
+AUTOMATIC = {
+    "_abc_impl",
+    "_all_schedulable_buffers",
+    "_backward_cls",
+    "_schedulable_buffers",
+}
+
+
+def test_no_private_method_of_a_base_class_is_overridden_by_accident():
+    found = set()
+    for info in pkgutil.walk_packages(torchrl_caiac.__path__, "torchrl_caiac."):
+        module = importlib.import_module(info.name)
+        for kind in vars(module).values():
+            if not inspect.isclass(kind) or kind.__module__ != info.name:
+                continue
+            for base in kind.__mro__[1:]:
+                if base.__module__.split(".")[0] in FOREIGN:
+                    common = {name for name in vars(kind) if private(name)}
+                    common &= set(vars(base))
+                    found |= {
+                        f"{kind.__name__}.{name}"
+                        for name in common - OVERRIDDEN - AUTOMATIC
+                    }
+    assert not found
 
 
 def rows(n):

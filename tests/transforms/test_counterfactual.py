@@ -71,6 +71,12 @@ def test_a_subclass_says_what_is_swapped_and_with_whom() -> None:
     assert (td == batch()).all()
 
 
+def test_it_moves_as_any_module() -> None:
+    transform = FromTheFirst(LAYOUT, **SETTINGS).to("cpu").float()
+    assert (transform(batch())["observation"] == batch()["observation"]).any()
+    assert list(transform.parameters()) == [] and transform.state_dict() == {}
+
+
 def test_what_a_subclass_lacks_is_named() -> None:
     with pytest.raises(TypeError, match="abstract method"):
         CounterfactualTransform(LAYOUT, **SETTINGS)  # type: ignore[abstract]

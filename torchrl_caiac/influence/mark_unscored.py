@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
-from torchrl.envs.transforms import Transform
 
+from torchrl_caiac._buffer_transform import BufferTransform
 from torchrl_caiac._keys import as_key
 
 __all__ = ["MarkUnscored", "mark_later_rows", "set_unscored"]
@@ -45,7 +45,7 @@ def set_unscored(
     return tensordict.set(key, nan)
 
 
-class MarkUnscored(Transform):
+class MarkUnscored(BufferTransform):
     """Sets the scores of all transitions that are written into a buffer to NaN.
 
     :func:`~torchrl_caiac.influence.score_buffer` appends it to each buffer that it
@@ -87,9 +87,6 @@ class MarkUnscored(Transform):
             TensorDictBase: the same sample.
         """
         return tensordict
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return set_unscored(tensordict, self.key, self.feature_shape)

@@ -11,8 +11,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
-from torchrl.envs.transforms import Transform
 
+from torchrl_caiac._buffer_transform import BufferTransform
 from torchrl_caiac._keys import as_key
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.mark_unscored import set_unscored
@@ -36,7 +36,7 @@ __all__ = ["CounterfactualTransform"]
 _Transform = TypeVar("_Transform", bound="CounterfactualTransform")
 
 
-class CounterfactualTransform(Transform, ABC):
+class CounterfactualTransform(BufferTransform, ABC):
     """Makes the last rows of a batch counterfactual, by their scores.
 
     A subclass defines what may be swapped (:meth:`swappable`) and how donors are drawn
@@ -262,9 +262,9 @@ class CounterfactualTransform(Transform, ABC):
         Returns:
             TensorDictBase: the batch with counterfactual rows and their flags.
         """
-        return self._apply(tensordict, *self._planner(tensordict), draw)
+        return self._swap(tensordict, *self._planner(tensordict), draw)
 
-    def _apply(
+    def _swap(
         self,
         td: TensorDictBase,
         plan: SwapPlan,
@@ -311,7 +311,7 @@ class CounterfactualTransform(Transform, ABC):
         scores = self._scores(tensordict)
         plan, values = self._planner(tensordict)
         draw = self.generate_parameters(scores)
-        out = self._apply(tensordict, plan, values, draw)
+        out = self._swap(tensordict, plan, values, draw)
         if self.check:
             self._batch_check(tensordict, out, scores, plan.states)
         if self._no_donor.device != draw.no_donor.device:

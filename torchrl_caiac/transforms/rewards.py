@@ -78,7 +78,8 @@ def recompute_reward(
         reward_key (NestedKey): the rewards ``[R]`` or ``[R, 1]``.
 
     Returns:
-        torch.Tensor: all rewards, shape and dtype as before.
+        torch.Tensor: all rewards, in the shape of the stored ones; in floating point if
+        the new ones are.
 
     Raises:
         KeyError: goals or rewards are missing.
@@ -164,7 +165,8 @@ def call_reward(
         like (torch.Tensor): rewards ``[B]`` or ``[B, 1]``.
 
     Returns:
-        torch.Tensor: the rewards, shape, dtype and device of ``like``.
+        torch.Tensor: the rewards, in the shape and on the device of ``like``, and in
+        its dtype unless that would cut them to integers.
 
     Raises:
         ValueError: the function returned another number of rewards.
@@ -178,4 +180,5 @@ def call_reward(
             f"reward_fn returned {found} for goals {list(achieved.shape)}, expected "
             f"[{rows}] or [{rows}, 1]"
         )
-    return new.reshape(like.shape).to(like)
+    cuts = new.is_floating_point() and not like.is_floating_point()
+    return new.reshape(like.shape).to(like.device, new.dtype if cuts else like.dtype)

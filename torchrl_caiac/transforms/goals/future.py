@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers import SampleUnit
-from torchrl.envs.transforms import Transform
 
+from torchrl_caiac._buffer_transform import BufferTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_integers, draw_numbers
 from torchrl_caiac._torchrl import storage_data
@@ -102,7 +102,7 @@ def _geometric(
     return draw_numbers(draw, device=device, generator=generator)
 
 
-class FutureGoal(Transform, SampleUnit):
+class FutureGoal(BufferTransform, SampleUnit):
     """Draws goals from a storage in ``expand``, for ``forward`` to write.
 
     The base of :class:`~torchrl_caiac.transforms.WindowGoal` and

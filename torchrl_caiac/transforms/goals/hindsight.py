@@ -268,6 +268,9 @@ class HindsightGoal(FutureGoal):
         goals: Goals = {}
         for key, reached in achieved.items():
             desired = self._desired(td, key, reached)
+            # Stored integers must not cut the goals that are reached.
+            cuts = reached.is_floating_point() and not desired.is_floating_point()
+            desired = desired.to(reached.dtype) if cuts else desired
             parts = [desired, reached.to(desired)]
             if draw.future is not None:
                 parts.append(draw.future[key].to(desired))
@@ -423,12 +426,17 @@ class HindsightGoal(FutureGoal):
         relabeled = tensordict.get(self.keys.relabeled, None)
         if relabeled is not None:
             relabeled.fill_(True)  # a view of the batch's flag, like all of these rows
-        return call_reward(
-            self.reward_fn,
-            _vector(achieved),
-            _vector(desired),
-            stored_reward(tensordict, self.keys.reward),
+        stored = stored_reward(tensordict, self.keys.reward)
+        reward = call_reward(
+            self.reward_fn, _vector(achieved), _vector(desired), stored
         )
+        if reward.dtype != stored.dtype:
+            raise ValueError(
+                f"{self.keys.reward!r} is stored as {stored.dtype}, in which "
+                f"HERReplayBuffer would cut rewards of {reward.dtype}: store rewards "
+                "in floating point"
+            )
+        return reward
 
     def extra_repr(self) -> str:
         """Returns the arguments, for ``repr``."""
