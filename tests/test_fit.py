@@ -302,6 +302,12 @@ def test_same_trajectory_number_in_two_data_sets_is_two_trajectories() -> None:
     assert numbers.tolist() == [0, 0, 0, 1, 2, 2, 2, 3]
 
 
+def test_transitions_of_one_id_stay_together() -> None:
+    """Parallel environments interleave their transitions."""
+    td = TensorDict({"episode": torch.tensor([7, 2, 7, 2, 7])}, [5])
+    assert module._trajectory_numbers([td], "episode").tolist() == [1, 0, 1, 0, 1]
+
+
 @pytest.mark.parametrize("fraction", [0.01, 0.1, 0.5, 0.99])
 def test_split_holds_out_whole_trajectories(fraction: float) -> None:
     trajectory = torch.randint(0, 13, (300,)).unique(return_inverse=True)[1]

@@ -431,9 +431,11 @@ def _trajectory_numbers(
         )
         if ids.is_floating_point():
             raise ValueError(f"{key!r} is {ids.dtype}, expected integers")
-        numbers = trajectory_index(td, trajectory_key=key, done_key=None).numbers()
-        parts.append(numbers.cpu() + offset)
-        offset = int(parts[-1][-1]) + 1
+        index = trajectory_index(td, trajectory_key=key, done_key=None)
+        # All runs of an id are one trajectory: parallel environments interleave theirs.
+        group = ids.reshape(-1)[index.starts].unique(return_inverse=True)[1]
+        parts.append(group[index.numbers()].cpu() + offset)
+        offset = int(parts[-1].max()) + 1
     return torch.cat(parts)
 
 

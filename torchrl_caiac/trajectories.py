@@ -249,7 +249,8 @@ def _leaves(
                 "the transitions lack the trajectory ids",
                 "pass trajectory_key= with the key of the ids, or trajectory_key=None "
                 "to use the end flags alone, which is correct only if the transitions "
-                "of each trajectory are consecutive",
+                "of each trajectory are consecutive (transforms take it as "
+                "keys=TransformKeys(trajectory=...))",
             )
     if done_key is not None:
         done = data.get(done_key, None)

@@ -91,6 +91,12 @@ def test_missing_folders_and_keys(tmp_path):
     assert len(load_transitions(tmp_path / "data", keys=["action"])) == 6
 
 
+def test_leaves_without_elements_have_no_file(tmp_path):
+    data = rows().set("nothing", torch.zeros(6, 0))
+    data.memmap(tmp_path / "data")
+    assert load_transitions(tmp_path / "data")["nothing"].shape == (6, 0)
+
+
 def change_meta(folder, change):
     meta = folder / "meta.json"
     content = json.loads(meta.read_text())

@@ -707,6 +707,23 @@ def test_donor_buffer_errors() -> None:
         CAIACTransform(FLAT, donors=two)(td)
 
 
+def test_donors_are_not_read_where_nothing_is_swapped() -> None:
+    td = small(batch=4).sample()
+    donors = ReplayBuffer(storage=LazyTensorStorage(20))
+    donors.extend(small().storage[:].exclude("desired_goal"))
+    out = CAIACTransform(FLAT, donors=donors, counterfactual_ratio=0.0)(td)
+    assert not out["caiac", "counterfactual"].any()
+
+
+def test_end_flags_end_a_window_even_with_ids() -> None:
+    td = small(window=4).storage[:8].clone()
+    CAIACTransform(FLAT, window=4)(td)
+    td["next", "done"][1] = True
+    with pytest.raises(ValueError, match=r"window 0 .*TransformKeys\(done=None\)"):
+        CAIACTransform(FLAT, window=4)(td)
+    CAIACTransform(FLAT, window=4, keys=TransformKeys(done=None))(td)
+
+
 # --- bad input -----------------------------------------------------------------------
 
 
@@ -854,6 +871,17 @@ def test_rows_extended_without_scores_count_as_unscored(storage) -> None:
     with pytest.raises(ValueError, match="not scored"):
         for _ in range(50):
             rb.sample()
+
+
+def test_float64_scores_stay_float64_when_rows_are_written() -> None:
+    rb = ReplayBuffer(storage=LazyTensorStorage(30), batch_size=4)
+    data = small().storage[:]
+    data["caiac", "score"] = data["caiac", "score"].double()
+    rb.extend(data)
+    rb.append_transform(CAIACTransform(FLAT))
+    rb.extend(data[:5])
+    score = rb.storage[:]["caiac", "score"]
+    assert score.dtype == torch.float64 and score[20:].isnan().all()
 
 
 def test_pickle_and_clone() -> None:

@@ -6,9 +6,9 @@ import pickle
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import LazyStackedTensorDict, TensorClass, TensorDict
 
-from torchrl_caiac import EntityLayout
+from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.transforms.draws import SwapDraw
 from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
 
@@ -85,6 +85,52 @@ def test_leaves_of_a_plan() -> None:
 def test_integer_states_are_swapped_and_not_checked() -> None:
     plan, _ = SwapPlanner(FLAT)(flat(3, torch.int64))
     assert plan.states == () and len(plan.leaves) == 2
+
+
+@pytest.mark.parametrize("stack", [False, True])
+def test_leaves_of_lazy_stacks_keep_their_names(stack: bool) -> None:
+    """A lazy stack orders its leaves differently in keys() and in items()."""
+
+    def row(i: int) -> TensorDict:
+        box = {"vel": torch.full((3,), float(i)), "pos": torch.full((3,), 100.0 + i)}
+        state = {"arm": torch.zeros(1), "box": box}
+        return TensorDict({**state, "next": state})
+
+    td = LazyStackedTensorDict(*map(row, range(8)))
+    if not stack:
+        td = td.contiguous()
+    layout = EntityLayout.from_keys({"arm": "arm", "box": "box"}, fixed=["arm"])
+    plan, values = SwapPlanner(layout)(td)
+    for leaf in plan.leaves:
+        assert torch.equal(values[leaf.place], td[leaf.key])
+    td["caiac", "score"] = torch.zeros(8, 2)
+    out = CAIACTransform(layout, counterfactual_ratio=1.0)(td)
+    assert (out["box", "pos"] - out["box", "vel"] == 100).all()
+    assert (out["box", "vel"] != td["box", "vel"]).any()
+
+
+class Pose(TensorClass):
+    x: torch.Tensor
+
+
+def test_what_entities_are_made_of() -> None:
+    td = nested(4)
+    td.set_non_tensor(("s", "name"), "kitchen")  # nobody's
+    planner = SwapPlanner(EntityLayout.from_keys({"pose": "pose"}))
+    pose = Pose(x=torch.arange(4.0), batch_size=[4])
+    td["pose"] = td["next", "pose"] = pose
+    plan, _ = planner(td)
+    assert [leaf.key for leaf in plan.leaves] == [("pose", "x"), ("next", "pose", "x")]
+    # A fixed entity may have a name: it is not swapped.
+    layout = EntityLayout.from_keys({"pose": "pose", "arm": "arm"}, fixed=["arm"])
+    for where in (td, td["next"]):
+        where["arm"] = TensorDict({"q": torch.zeros(4)}, [4])
+        where["arm"].set_non_tensor("name", "left")
+    plan, _ = SwapPlanner(layout)(td)
+    assert ("arm", "q") in plan.states and len(plan.leaves) == 2
+    layout = EntityLayout.from_keys({"pose": "pose", "arm": "arm"})
+    with pytest.raises(TypeError, match=r"\('arm', 'name'\) is a .*made of tensors"):
+        SwapPlanner(layout)(td)
 
 
 def test_old_plans_are_dropped() -> None:

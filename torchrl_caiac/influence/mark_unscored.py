@@ -29,8 +29,8 @@ def set_unscored(
             or ``(N + 1, N)`` for graphs.
 
     Returns:
-        TensorDictBase: the same tensordict, with float32 NaN
-        ``[*B, *feature_shape]`` in ``key``.
+        TensorDictBase: the same tensordict, with NaN ``[*B, *feature_shape]`` in
+        ``key``, float32 or in the dtype that the leaf had.
 
     Examples:
         >>> import torch
@@ -41,7 +41,11 @@ def set_unscored(
         tensor([[nan, nan]])
     """
     shape = (*tensordict.batch_size, *feature_shape)
-    nan = torch.full(shape, torch.nan, dtype=torch.float32, device=tensordict.device)
+    old = tensordict.get(key, None)
+    # Scores that come with the transitions have the dtype of the storage's.
+    known = isinstance(old, torch.Tensor) and old.is_floating_point()
+    dtype = old.dtype if known else torch.float32
+    nan = torch.full(shape, torch.nan, dtype=dtype, device=tensordict.device)
     return tensordict.set(key, nan)
 
 

@@ -196,7 +196,8 @@ class RunningNorm(nn.Module):
             self.update(x)
         else:
             self._check(x)
-        x = x - self.shift
+        # In float64, features far from zero keep their small differences.
+        x = x - (self.mean if x.dtype == torch.float64 else self.shift)
         # A quotient rounds once. A product is faster, but rounds twice.
         x = x / self.divisor if self.frozen else x * self.gain
         return x.to(self.dtype)

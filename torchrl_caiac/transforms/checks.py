@@ -218,18 +218,18 @@ class BatchCheck:
             ValueError: a value is not finite, or a window crosses a trajectory's end.
         """
         observed = [after.get(key) for key in states]
-        neighbours = self._neighbours(before)
+        crossings = self._crossings(before)
         leaves = [scores, *observed]
         # A sum is finite if all its terms are (unless it overflows: see _explain).
         if not LateCheck.needed(scores.device):
             finite = math.isfinite(sum(leaf.sum().item() for leaf in leaves))
-            if not finite or not (neighbours is None or torch.equal(*neighbours)):
-                self._explain(after, scores, states, neighbours)
+            if not finite or (crossings is not None and bool(crossings.any())):
+                self._explain(after, scores, states, crossings)
             return
         found = self._late.found()
         if found:
             # The newest batch is likely to have the same fault.
-            self._explain(after, scores, states, neighbours)
+            self._explain(after, scores, states, crossings)
             names = [self.score_key, *states, "the windows"]
             raise ValueError(
                 f"{[names[place] for place in found]} were invalid in an earlier "
@@ -238,34 +238,33 @@ class BatchCheck:
                 "sample the same data on the CPU to find the rows"
             )
         sums = [leaf.sum(dtype=torch.float64) for leaf in leaves]
-        if neighbours is not None:
-            crosses = (neighbours[0] != neighbours[1]).any()
-            sums.append(torch.where(crosses, math.nan, 0.0).double())
+        if crossings is not None:
+            sums.append(torch.where(crossings.any(), math.nan, 0.0).double())
         self._late.add(torch.stack(sums))
 
-    def _neighbours(
-        self, td: TensorDictBase
-    ) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Returns two ``[B, window - 1]``, equal where windows stay in a trajectory."""
+    def _crossings(self, td: TensorDictBase) -> torch.Tensor | None:
+        """Returns where a window leaves its trajectory, bool ``[B, window - 1]``."""
         if self.window == 1:
             return None
-        keys = self.keys
-        ids = None if keys.trajectory is None else td.get(keys.trajectory, None)
-        if ids is not None:
-            ids = ids.reshape(-1, self.window)
-            return ids[:, 1:], ids[:, :-1]
-        done = None if keys.done is None else td.get(keys.done, None)
-        if done is None:
-            return None
-        done = done.reshape(-1, self.window)[:, :-1].bool()
-        return done, torch.zeros_like(done)
+        found = None
+        if self.keys.trajectory is not None:
+            ids = td.get(self.keys.trajectory, None)
+            if ids is not None:
+                ids = ids.reshape(-1, self.window)
+                found = ids[:, 1:] != ids[:, :-1]
+        if self.keys.done is not None:
+            done = td.get(self.keys.done, None)
+            if done is not None:
+                ended = done.reshape(-1, self.window)[:, :-1].bool()
+                found = ended if found is None else found | ended
+        return found
 
     def _explain(
         self,
         after: TensorDictBase,
         scores: torch.Tensor,
         states: Sequence[NestedKey],
-        neighbours: tuple[torch.Tensor, torch.Tensor] | None,
+        crossings: torch.Tensor | None,
     ) -> None:
         nan, infinite = scores.isnan(), scores.isinf()
         if nan.any():
@@ -280,13 +279,14 @@ class BatchCheck:
                 f"{self.score_key!r} is infinite for {self._entities(infinite)}: check "
                 "the influence measure, then call score_buffer(..., overwrite=True)"
             )
-        if neighbours is not None and not torch.equal(*neighbours):
-            crosses = neighbours[0] != neighbours[1]
-            window = int(crosses.any(1).nonzero()[0, 0])
+        if crossings is not None and crossings.any():
+            window = int(crossings.any(1).nonzero()[0, 0])
             raise ValueError(
-                f"window {window} of {self.window} rows crosses a trajectory's end: "
-                f"use SliceSampler with slice_len={self.window} and "
-                "strict_length=True, and trajectories of at least this length"
+                f"window {window} of {self.window} rows crosses a trajectory's end "
+                f"according to {self.keys.trajectory!r} or {self.keys.done!r}: use "
+                f"SliceSampler with slice_len={self.window}, strict_length=True and "
+                "trajectories of at least this length. If end flags do not end a "
+                "trajectory in these data, pass keys=TransformKeys(done=None)"
             )
         for key in states:
             bad = ~after.get(key).isfinite()

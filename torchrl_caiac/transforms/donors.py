@@ -294,6 +294,8 @@ class BufferDonors:
         """Applies what :meth:`draw` returned, see :func:`apply_swap`."""
         _, trajectories = self.index()
         data = self._data()
+        if not len(draw.swapped):
+            return td.copy()
         read = self._read
         if read is None or read[0] is not plan or read[1] is not data:
             self._read = read = plan, data, self._sources(data, plan, values)

@@ -13,7 +13,12 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from tensordict import TensorDictBase, is_leaf_nontensor
+from tensordict import (
+    TensorDictBase,
+    is_leaf_nontensor,
+    is_non_tensor,
+    is_tensor_collection,
+)
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join
@@ -118,16 +123,20 @@ class SwapPlanner:
             TypeError: an entity contains something other than tensors.
         """
         found: list[Any] = [td.get(source.key, None) for source in self._sources]
+        keys: list[tuple[NestedKey, _Source]] = []
         if self.layout.is_flat:
             signature: Hashable = tuple(map(_signature, found))
         else:
-            found, signature = _expanded(self._sources, found)
+            keys, found, signature = _expanded(self._sources, found)
         plan = self._plans.get(signature)
         if plan is None:
             if len(self._plans) >= _MAX_PLANS:
                 self._plans.clear()
-            make = self._flat_plan if self.layout.is_flat else self._plan
-            plan = self._plans[signature] = make(td, found)
+            if self.layout.is_flat:
+                plan = self._flat_plan(td, found)
+            else:
+                plan = self._plan(td, keys, found)
+            self._plans[signature] = plan
         return plan, found
 
     def _flat_plan(self, td: TensorDictBase, found: list[Any]) -> SwapPlan:
@@ -180,15 +189,19 @@ class SwapPlanner:
         ]
         return SwapPlan(tuple(leaves), tuple(states))
 
-    def _plan(self, td: TensorDictBase, found: list[Any]) -> SwapPlan:
-        keys, owners = _expanded_keys(self._sources, td)
+    def _plan(
+        self,
+        td: TensorDictBase,
+        keys: list[tuple[NestedKey, _Source]],
+        found: list[Any],
+    ) -> SwapPlan:
         if any(o.is_required and td.get(o.key, None) is None for o in self._sources):
             self.layout.check(td, next=True)
         leaves, states = [], []
-        for place, (key, source, value) in enumerate(
-            zip(keys, owners, found, strict=True)
-        ):
+        for place, ((key, source), value) in enumerate(zip(keys, found, strict=True)):
             if not isinstance(value, torch.Tensor):
+                if not source.is_swapped:
+                    continue  # nothing happens to it
                 raise TypeError(
                     f"{key!r} is a {type(value).__name__}, but an entity is made of "
                     "tensors: leave it out of the entity's sub-tensordict"
@@ -252,38 +265,27 @@ def _signature(value: Any) -> Hashable:
 
 def _expanded(
     sources: Sequence[_Source], found: list[Any]
-) -> tuple[list[Any], Hashable]:
-    """Returns the leaves of a nested layout, and what plans depend on."""
+) -> tuple[list[tuple[NestedKey, _Source]], list[Any], Hashable]:
+    """Returns the leaves of a nested layout, and what plans depend on.
+
+    Keys and values come from the same iteration: lazy stacks order them differently in
+    ``keys`` and ``items``.
+    """
+    keys: list[tuple[NestedKey, _Source]] = []
     values: list[Any] = []
     signature: list[Hashable] = []
-    for value in found:
-        if isinstance(value, TensorDictBase):
+    for source, value in zip(sources, found, strict=True):
+        if is_tensor_collection(value) and not is_non_tensor(value):
             items = list(value.items(True, True, is_leaf=is_leaf_nontensor))
+            keys += [(join(source.key, below), source) for below, _ in items]
             values += [leaf for _, leaf in items]
             signature.append(tuple((k, _signature(leaf)) for k, leaf in items))
         else:
             if value is not None:
+                keys.append((source.key, source))
                 values.append(value)
             signature.append(_signature(value))
-    return values, tuple(signature)
-
-
-def _expanded_keys(
-    sources: Sequence[_Source], td: TensorDictBase
-) -> tuple[list[NestedKey], list[_Source]]:
-    """Returns the keys of the leaves of :func:`_expanded`, and their owners."""
-    keys: list[NestedKey] = []
-    owners: list[_Source] = []
-    for source in sources:
-        value = td.get(source.key, None)
-        if isinstance(value, TensorDictBase):
-            for below in value.keys(True, True, is_leaf=is_leaf_nontensor):
-                keys.append(join(source.key, below))
-                owners.append(source)
-        elif value is not None:
-            keys.append(source.key)
-            owners.append(source)
-    return keys, owners
+    return keys, values, tuple(signature)
 
 
 # --- applying ------------------------------------------------------------------------

@@ -206,9 +206,10 @@ class WindowGoal(FutureGoal):
         if found:
             raise ValueError(
                 f"the sampler drew windows of {self.window} rows that are not "
-                "consecutive rows of one trajectory: use SliceSampler with "
-                f"slice_len={self.window} and strict_length=True, and trajectories "
-                f"in {self.keys.trajectory!r}"
+                "consecutive rows of one trajectory according to "
+                f"{self.keys.trajectory!r} and {self.keys.done!r}: use SliceSampler "
+                f"with slice_len={self.window} and strict_length=True. If end flags do "
+                "not end a trajectory in these data, pass keys=TransformKeys(done=None)"
             )
 
     def donor_goals(
