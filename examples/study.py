@@ -150,7 +150,12 @@ def report_table(
 
 def method_labels(cfg: DictConfig) -> dict[str, str]:
     """Returns the names of the methods in figures."""
-    return {name: m.label for name, m in make_methods(cfg).items() if m.label}
+    # A method that extends another one does not take over its label.
+    labels = {
+        name: vars(type(method)).get("label", "")
+        for name, method in make_methods(cfg).items()
+    }
+    return {name: label for name, label in labels.items() if label}
 
 
 def draw_curves(cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path) -> None:

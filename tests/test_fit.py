@@ -422,7 +422,7 @@ def test_wrong_data_are_named(tmp_path: Path) -> None:
     refused(KeyError, "next", data.exclude("next"))
     other = data.clone()
     other["action"] = torch.zeros(100, 5)
-    refused(ValueError, r"'action' have the shape \[100, 5\].*\[100, 2\]", other)
+    refused(ValueError, r"shape of 'action' is \[100, 5\].*\[100, 2\]", other)
     other = data.clone()
     other["episode"] = torch.zeros(100)
     refused(ValueError, "'episode' is torch.float32", other)

@@ -269,7 +269,7 @@ class _Rows:
                 ):
                     if tuple(x.shape) != (len(part), size):
                         raise ValueError(
-                            f"{what} have the shape {list(x.shape)}, expected "
+                            f"the shape of {what} is {list(x.shape)}, expected "
                             f"{[len(part), size]}: give the data that the model's "
                             "layout describes"
                         )

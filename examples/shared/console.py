@@ -116,7 +116,12 @@ class Console:
         begin = time.perf_counter()
         try:
             yield
+        except KeyboardInterrupt:
+            self._screen.write(" interrupted, run again to resume\n")
+            self._screen.flush()
+            raise
         except BaseException:
+            logging.getLogger(__name__).exception("%s failed", name)
             self._screen.write(f" failed, see {self.log}\n")
             self._screen.flush()
             raise

@@ -14,7 +14,11 @@ __all__ = ["MarkUnscored", "mark_later_rows", "set_unscored"]
 
 
 def set_unscored(
-    tensordict: TensorDictBase, key: NestedKey, feature_shape: tuple[int, ...]
+    tensordict: TensorDictBase,
+    key: NestedKey,
+    feature_shape: tuple[int, ...],
+    *,
+    dtype: torch.dtype = torch.float32,
 ) -> TensorDictBase:
     """Sets the scores of transitions to NaN, which means not scored.
 
@@ -28,9 +32,13 @@ def set_unscored(
         feature_shape (tuple of int): the shape of the scores of a transition: ``(N,)``,
             or ``(N + 1, N)`` for graphs.
 
+    Keyword Args:
+        dtype (torch.dtype): that of the leaf in the storage. Defaults to float32, which
+            ``score_buffer`` writes.
+
     Returns:
         TensorDictBase: the same tensordict, with NaN ``[*B, *feature_shape]`` in
-        ``key``, float32 or in the dtype that the leaf had.
+        ``key``.
 
     Examples:
         >>> import torch
@@ -41,10 +49,6 @@ def set_unscored(
         tensor([[nan, nan]])
     """
     shape = (*tensordict.batch_size, *feature_shape)
-    old = tensordict.get(key, None)
-    # Scores that come with the transitions have the dtype of the storage's.
-    known = isinstance(old, torch.Tensor) and old.is_floating_point()
-    dtype = old.dtype if known else torch.float32
     nan = torch.full(shape, torch.nan, dtype=dtype, device=tensordict.device)
     return tensordict.set(key, nan)
 

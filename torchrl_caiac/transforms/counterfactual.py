@@ -320,7 +320,11 @@ class CounterfactualTransform(BufferTransform, ABC):
         return out
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return set_unscored(tensordict, self.score_key, self.feature_shape)
+        # Scores of another origin, which come with the rows, may have another dtype.
+        scores = tensordict.get(self.score_key, None)
+        known = scores is not None and scores.is_floating_point()
+        dtype = scores.dtype if known else torch.float32
+        return set_unscored(tensordict, self.score_key, self.feature_shape, dtype=dtype)
 
     def _scores(self, td: TensorDictBase) -> torch.Tensor:
         if td.ndim != 1 or not td.shape[0]:
