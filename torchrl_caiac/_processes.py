@@ -187,8 +187,8 @@ def _run_job(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
 
 def _can_be_pickled(error: Exception) -> bool:
     try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
+        pickle.loads(pickle.dumps(error))  # as the pool does; our own bytes
+    except Exception:  # __reduce__ and __init__ of any class may raise anything
         return False
     return True
 

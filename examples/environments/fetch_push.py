@@ -26,6 +26,11 @@ from torchrl_caiac.plotting import bootstrap_interval
 __all__ = ["FetchPush"]
 
 LAYOUT = fetch_push_layout(2)
+# The columns of the gripper and its fingers, and of the cubes.
+POSITIONS = {
+    name: LAYOUT.columns[name][:n]
+    for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
+}
 MEASURES = ("full", "cube0", "cube1", "final")
 MAKERS = {"expert": create_fetch_push_expert, "random": create_fetch_push_random}
 
@@ -38,11 +43,7 @@ class FetchPush(Environment):
 
     layout = LAYOUT
     action_dim = 4
-    # The positions of the gripper and its fingers, and of the cubes.
-    predicted = {  # noqa: RUF012
-        name: LAYOUT.columns[name][:n]
-        for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
-    }
+    predicted = POSITIONS
     goal_reference = "gripper"
     reward_fn = staticmethod(fetch_push_reward)
     data_name = "episodes"

@@ -226,6 +226,6 @@ def test_rejects_bad_gaussians(loc: Any, var: Any, message: str) -> None:
 def test_rejects_bad_options() -> None:
     loc, var = torch.zeros(3, 1), torch.ones(3, 1)
     with pytest.raises(ValueError, match="'mean'"):
-        causal_action_influence(loc, var, approximation="mean")  # type: ignore
+        causal_action_influence(loc, var, approximation="mean")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="max_memory"):
         causal_action_influence(loc, var, max_memory=0)

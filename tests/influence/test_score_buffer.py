@@ -34,6 +34,7 @@ from tests.influence.scoring import (
     square,
 )
 from torchrl_caiac import EntityLayout
+from torchrl_caiac._torchrl import storage_data
 from torchrl_caiac.influence import (
     CAI,
     score_buffer,
@@ -246,9 +247,9 @@ def test_full_and_partly_filled_storages(kind, size, tmp_path):
     )
     rb.sample()
     score_buffer(rb, Read(), 5, smoothing=3, progress=False)
-    assert rb.storage._storage.is_memmap() == (kind != "memory")
+    assert rb.storage[:].is_memmap() == (kind != "memory")
     torch.testing.assert_close(scores(rb), definition(rows, square, 3, 1))
-    assert rb.storage._storage[KEY][12:].isnan().all()
+    assert storage_data(rb.storage)[KEY][12:].isnan().all()
     for _ in range(3):
         batch = rb.sample()
         assert batch[KEY].shape == (4, 3)

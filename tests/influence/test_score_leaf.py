@@ -73,7 +73,7 @@ def test_a_leaf_of_another_origin_is_replaced_only_on_request(kind, leaf, tmp_pa
     assert torch.equal(scores(rb), leaf)
     score_buffer(rb, Read(), overwrite=True, progress=False)
     torch.testing.assert_close(scores(rb), definition(rows, square, 1, 1))
-    assert rb.storage._storage.is_memmap() == (kind == "memmap")
+    assert rb.storage[:].is_memmap() == (kind == "memmap")
     if kind == "memmap":
         again = TensorDict.load_memmap(tmp_path / "data")
         assert torch.equal(again[KEY], scores(rb))

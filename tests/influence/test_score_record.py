@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
@@ -54,7 +55,8 @@ def test_interrupted_before_the_leaf_was_initialized(tmp_path):
     score_buffer(rb, Read(), progress=False)
     record = json.loads(score_file(tmp_path / "data").read_text())
     score_file(tmp_path / "data").write_text(json.dumps({**record, "state": "new"}))
-    rb.storage._storage[KEY].zero_()
+    TensorDict.load_memmap(tmp_path / "data")[KEY].zero_()
+    assert (scores(rb) == 0).all()
     score_buffer(rb, Read(), progress=False)
     torch.testing.assert_close(scores(rb), definition(rows, square, 1, 1))
 

@@ -141,11 +141,8 @@ class Case:
 
 
 def time_order(rb: ReplayBuffer) -> list[int]:
-    """The storage's rows from the oldest to the newest."""
-    length, cursor = len(rb), rb.storage._last_cursor_index
-    if length < rb.storage.max_size or cursor is None:
-        return list(range(length))
-    return [(cursor + 1 + i) % length for i in range(length)]
+    """The storage's rows from the oldest to the newest: their names increase."""
+    return rb.storage[:]["row"].argsort().tolist()
 
 
 def donor_windows(

@@ -29,6 +29,7 @@ from tests.transforms.test_caiac import (
     time_order,
 )
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac._torchrl import add_revision, storage_data
 from torchrl_caiac.transforms import HindsightGoal, TransformKeys, WindowGoal
 
 THRESHOLD = 0.25
@@ -447,8 +448,8 @@ def test_graphs_of_the_wrong_shape() -> None:
         KeyError, match=r"donor buffer has no graphs in 'other'.*graph_"
     ):
         transform(td.copy().set("other", graph))
-    donors.storage._storage["other"] = torch.zeros(20, N, N)
-    donors.storage._bump_mutation_revision()
+    storage_data(donors.storage)["other"] = torch.zeros(20, N, N)
+    add_revision(donors.storage)
     with pytest.raises(ValueError, match=r"shape \[20, 3, 3\], expected \[20, 4, 3\]"):
         transform(td.copy().set("other", graph))
 

@@ -125,6 +125,7 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
         ('gripper', 'cube0', 'cube1')
     """
 
+    # gymnasium declares it without ClassVar, which mypy reports
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
         "render_modes": ["rgb_array"],
         "render_fps": 25,

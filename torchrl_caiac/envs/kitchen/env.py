@@ -112,6 +112,7 @@ class KitchenEnv(gymnasium.Env[dict[str, Any], Any]):
         ('robot', 'bottom_right_burner', 'bottom_burner')
     """
 
+    # gymnasium declares it without ClassVar, which mypy reports
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
         "render_modes": ["rgb_array"],
         "render_fps": 12,
