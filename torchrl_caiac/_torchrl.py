@@ -7,6 +7,7 @@ and that no other module uses such a name.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from tensordict import MemoryMappedTensor, TensorDictBase, is_tensor_collection
 from tensordict._utils_key_json import _encode_key_for_filesystem
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data import ReplayBuffer, TensorDictMaxValueWriter, TensorStorage
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import _vmap_func
 
@@ -24,6 +25,7 @@ __all__ = [
     "drop_prefetched",
     "file_name",
     "forget_leaves",
+    "is_in_order_of_time",
     "known_to_be_memmap",
     "last_written",
     "linear_pointwise",
@@ -33,8 +35,10 @@ __all__ = [
     "packed_weight",
     "priority_weight",
     "reduce_loss",
+    "sampling_buffer",
     "storage_data",
     "storage_revision",
+    "storage_rows",
     "vmap_loss",
 ]
 
@@ -84,6 +88,45 @@ def storage_data(storage: Any, what: str = "the storage") -> TensorDictBase:
     return data
 
 
+def storage_rows(storage: Any, what: str = "the storage") -> TensorDictBase:
+    """Returns the rows of a storage at its full capacity, without copying them.
+
+    Args:
+        storage (TensorStorage): the storage.
+        what (str): the storage's name in error messages.
+
+    Returns:
+        TensorDictBase: the storage's own tensordict ``[T]``, or a view of it with its
+        dimensions flattened. Adding a leaf to the view does not add it to the storage.
+
+    Raises:
+        TypeError: it is not a :class:`~torchrl.data.TensorStorage` of tensordicts.
+        ValueError: it is empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> from torchrl_caiac._torchrl import storage_rows
+        >>> storage = LazyTensorStorage(6, ndim=2)
+        >>> storage.set(range(2), TensorDict({"a": torch.zeros(2, 3)}, [2, 3]))
+        >>> storage_rows(storage)["a"].shape
+        torch.Size([6])
+    """
+    data = storage_data(storage, what)
+    dims = storage.ndim
+    if dims == 1:
+        return data
+    rows = data.batch_size[:dims].numel()
+
+    def flat(leaf: Tensor) -> Tensor:
+        return leaf.as_subclass(Tensor).view(rows, *leaf.shape[dims:])
+
+    flattened = data.apply(flat, batch_size=[rows], device=data.device)
+    assert flattened is not None  # it would be None without leaves
+    return flattened
+
+
 def storage_revision(storage: TensorStorage) -> tuple[Any, ...]:
     """Returns a value that changes with every write through the storage."""
     return (
@@ -105,16 +148,16 @@ def forget_leaves(storage: TensorStorage) -> None:
 
 
 def last_written(source: ReplayBuffer | TensorStorage) -> int | None:
-    """Returns the row that was written last.
+    """Returns the row, in the first dimension, that was written last.
 
-    In a buffer that was loaded from disk, only the cursor of the writer records this
-    row, so pass the buffer if there is one.
+    The writer of the buffer records it. A storage does too, but forgets it when it is
+    saved and loaded.
 
     Args:
         source (ReplayBuffer or TensorStorage): the buffer, or its storage.
 
     Returns:
-        int, optional: the row; ``None`` if neither the storage nor the writer records
+        int, optional: the row; ``None`` if neither a writer nor the storage records
         it, as in a buffer over an existing dataset.
 
     Examples:
@@ -127,15 +170,55 @@ def last_written(source: ReplayBuffer | TensorStorage) -> int | None:
         >>> last_written(rb)
         2
     """
-    is_buffer = isinstance(source, ReplayBuffer)
-    storage = source.storage if is_buffer else source
+    cursors = [
+        int(writer._cursor)
+        for writer in _writers(source)
+        if getattr(writer, "_cursor", None) is not None and writer._write_count
+    ]
+    storage = source.storage if isinstance(source, ReplayBuffer) else source
+    if len(cursors) == 1 and len(storage):
+        steps = len(storage)
+        if storage.ndim > 1:
+            steps //= storage.shape[1:].numel()
+        return (cursors[0] - 1) % steps
     newest = getattr(storage, "_last_cursor_index", None)
-    if newest is not None:
-        return int(newest)
-    cursor = getattr(source.writer, "_cursor", None) if is_buffer else None
-    if cursor is None or not len(storage):
-        return None
-    return (int(cursor) - 1) % len(storage)
+    return None if newest is None else int(newest)
+
+
+def is_in_order_of_time(source: ReplayBuffer | TensorStorage) -> bool:
+    """Returns whether no writer of a storage replaces rows out of turn.
+
+    Args:
+        source (ReplayBuffer or TensorStorage): the buffer, or its storage.
+
+    Returns:
+        bool: false if one of them is a :class:`~torchrl.data.TensorDictMaxValueWriter`.
+    """
+    return not any(isinstance(w, TensorDictMaxValueWriter) for w in _writers(source))
+
+
+def _writers(source: ReplayBuffer | TensorStorage) -> list[Any]:
+    """Returns the writers of the buffers that use a storage."""
+    storage = source.storage if isinstance(source, ReplayBuffer) else source
+    attached = getattr(storage, "_attached_entities", [])
+    buffers = [rb for rb in attached if isinstance(rb, ReplayBuffer)]
+    if isinstance(source, ReplayBuffer) and source not in buffers:
+        buffers.append(source)
+    return [rb.writer for rb in buffers]
+
+
+def sampling_buffer() -> ReplayBuffer | None:
+    """Returns the buffer that is sampling in this thread, found in the call stack.
+
+    A buffer does not make itself known to its transforms.
+    """
+    frame = sys._getframe(1)
+    while frame is not None:
+        if frame.f_code is ReplayBuffer._sample.__code__:
+            buffer: ReplayBuffer = frame.f_locals["self"]
+            return buffer
+        frame = frame.f_back  # type: ignore[assignment]
+    return None
 
 
 def drop_prefetched(rb: ReplayBuffer) -> None:

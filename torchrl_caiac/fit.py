@@ -432,7 +432,7 @@ def _trajectory_numbers(
         if ids.is_floating_point():
             raise ValueError(f"{key!r} is {ids.dtype}, expected integers")
         index = trajectory_index(td, trajectory_key=key, done_key=None)
-        # All runs of an id are one trajectory: parallel environments interleave theirs.
+        # Numbered by id, so that the split does not depend on the order of the data.
         group = ids.reshape(-1)[index.starts].unique(return_inverse=True)[1]
         parts.append(group[index.numbers()].cpu() + offset)
         offset = int(parts[-1].max()) + 1

@@ -10,22 +10,41 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
-from torchrl_caiac._keys import missing_key
-from torchrl_caiac._torchrl import last_written, storage_data, storage_revision
+from torchrl_caiac._keys import missing_key, path
+from torchrl_caiac._torchrl import (
+    is_in_order_of_time,
+    last_written,
+    storage_revision,
+    storage_rows,
+)
 
-__all__ = ["TrajectoryCache", "TrajectoryIndex", "trajectory_index"]
+__all__ = [
+    "COLLECTOR_KEY",
+    "STEPS_KEY",
+    "TrajectoryCache",
+    "TrajectoryIndex",
+    "flat_rows",
+    "trajectory_index",
+]
 
-# The key of the trajectory ids of TorchRL's collectors.
-_COLLECTOR_KEY: NestedKey = ("collector", "traj_ids")
+#: The key of the trajectory ids of TorchRL's collectors.
+COLLECTOR_KEY: NestedKey = ("collector", "traj_ids")
+# The end flags that data without ``("next", "done")`` may have instead.
+_PARTS_OF_DONE = ("terminated", "truncated")
+#: TorchRL's MultiStepTransform: the steps from a row's state to its next state.
+STEPS_KEY: NestedKey = "steps_to_next_obs"
 _CHUNK = 1 << 20
 
 
 class TrajectoryIndex(NamedTuple):
     """The trajectories of a storage, in the order of time.
 
-    The row ``r`` has the position ``(r - oldest) % length``. Positions count from the
-    oldest row, so that no trajectory wraps around. The index takes 4 bytes for each
-    row.
+    Each row has a position. The rows of a trajectory are at consecutive positions, in
+    the order of time, wherever they lie in the storage. The index takes 4 bytes for
+    each row if trajectories lie one after another, and 12 if they are interleaved.
+
+    The rows of a storage with several dimensions, ``[T, *B]``, are counted in the order
+    of its flattened data: row ``t * B + b`` is step ``t`` of the environment ``b``.
 
     Attributes:
         length (int): the number of rows in the storage, ``T``.
@@ -34,12 +53,17 @@ class TrajectoryIndex(NamedTuple):
             trajectory, ascending.
         left (torch.Tensor): integer ``[T]``, the number of rows of the same trajectory
             after each row.
+        order (torch.Tensor, optional): integer ``[T]``, the row at each position;
+            ``None`` if this is ``(position + oldest) % length``.
+        place (torch.Tensor, optional): integer ``[T]``, the position of each row.
     """
 
     length: int
     oldest: int
     ends: torch.Tensor
     left: torch.Tensor
+    order: torch.Tensor | None = None
+    place: torch.Tensor | None = None
 
     @property
     def device(self) -> torch.device:
@@ -57,22 +81,25 @@ class TrajectoryIndex(NamedTuple):
         return self.rows(self.ends - self.lengths + 1)
 
     @property
-    def wraps(self) -> bool:
-        """Whether a trajectory continues from the last row to the first."""
-        return self.oldest > 0 and bool(self.left[self.length - 1] > 0)
+    def is_storage_order(self) -> bool:
+        """Whether positions are rows, so that no row needs to be looked up."""
+        return self.order is None and self.oldest == 0
 
     def position(self, rows: torch.Tensor) -> torch.Tensor:
         """Returns the positions of rows ``[*]``, int64 ``[*]``."""
-        return (rows - self.oldest) % self.length
+        if self.place is not None:
+            return _picked(self.place, rows)
+        return (rows - self.oldest) % self.length if self.oldest else rows
 
     def rows(self, position: torch.Tensor) -> torch.Tensor:
         """Returns the rows at positions ``[*]``, int64 ``[*]``."""
-        return (position + self.oldest) % self.length
+        if self.order is not None:
+            return _picked(self.order, position)
+        return (position + self.oldest) % self.length if self.oldest else position
 
     def remaining(self, rows: torch.Tensor) -> torch.Tensor:
         """Returns the number of later rows in each row's trajectory, int64 ``[*]``."""
-        found = self.left.index_select(0, rows.to(self.device).reshape(-1))
-        return found.view(rows.shape).long()
+        return _picked(self.left, rows)
 
     def is_last(self, rows: torch.Tensor) -> torch.Tensor:
         """Returns whether rows ``[*]`` are the last of a trajectory, bool ``[*]``."""
@@ -83,12 +110,17 @@ class TrajectoryIndex(NamedTuple):
 
         The number of steps must be at most :meth:`remaining`.
         """
-        return (rows + steps) % self.length
+        if self.order is None:
+            return (rows + steps) % self.length
+        return self.rows((self.position(rows) + steps).clamp_max(self.length - 1))
 
     def numbers(self) -> torch.Tensor:
         """Returns the trajectory of each row, 0, 1, ... by time, int64 ``[T]``."""
         counts = torch.arange(len(self.ends), device=self.device)
-        return counts.repeat_interleave(self.lengths).roll(self.oldest)
+        found = counts.repeat_interleave(self.lengths)
+        if self.place is not None:
+            return _picked(found, self.place)
+        return found.roll(self.oldest)
 
 
 def trajectory_index(
@@ -99,16 +131,26 @@ def trajectory_index(
 ) -> TrajectoryIndex:
     """Finds the trajectories of stored transitions.
 
-    The transitions of a trajectory are consecutive. A trajectory ends where the id in
-    ``trajectory_key`` changes, where ``done_key`` is set, at the row that was written
-    last, and at the end of the storage. In a full ring, a trajectory continues from the
-    last row to the first. If the data lack ``trajectory_key``, the ids of TorchRL's
-    collectors in ``("collector", "traj_ids")`` are used. Data with ids may lack
-    ``done_key``.
+    The transitions with the same id in ``trajectory_key`` are one trajectory, in the
+    order of time, wherever they lie: parallel environments may be interleaved. A
+    trajectory also ends where ``done_key`` is set, at the row that was written last,
+    and at the end of the storage; a later transition with the same id begins another
+    one. In a full ring, time begins after the row that was written last. In a storage
+    with several dimensions, ``[T, *B]``, the first one is time, and the others are
+    environments, whose transitions never belong to the same trajectory.
+
+    If the data lack ``trajectory_key``, the ids of TorchRL's collectors in
+    ``("collector", "traj_ids")`` are used. If they lack ``("next", "done")``,
+    ``("next", "terminated")`` and ``("next", "truncated")`` are used, if present. Data
+    with ids may lack all of these. Without ids (``trajectory_key=None``), the
+    transitions of a trajectory are consecutive.
+
+    Transitions of :class:`~torchrl.envs.MultiStepTransform` have the end flags of the
+    state ``steps_to_next_obs`` later: only the last of them ends the trajectory.
 
     Args:
         source (ReplayBuffer, TensorStorage or TensorDictBase): the transitions
-            ``[T]``.
+            ``[T]``, or a buffer or storage of ``[T, *B]``.
 
     Keyword Args:
         trajectory_key (NestedKey, optional): the key of the trajectory ids, ``[T]`` or
@@ -123,53 +165,115 @@ def trajectory_index(
         KeyError: the data lack the ids or the end flags.
         TypeError: the storage does not contain a tensordict, or an entry is not a
             tensor.
-        ValueError: the storage is empty or has several dimensions, an entry does not
-            have one value for each row, or both keys are ``None``.
+        ValueError: the storage is empty, or its rows are not in the order of time; an
+            entry does not have one value for each row; or both keys are ``None``.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_caiac.trajectories import trajectory_index
         >>> index = trajectory_index(
-        ...     TensorDict({"episode": torch.tensor([0, 0, 0, 1])}, [4])
+        ...     TensorDict({"episode": torch.tensor([0, 1, 0, 1, 0])}, [5])
         ... )
-        >>> index.ends, index.remaining(torch.tensor([0, 2]))
-        (tensor([2, 3]), tensor([2, 0]))
+        >>> rows = torch.arange(3)
+        >>> index.remaining(rows), index.later(rows, 1)
+        (tensor([2, 1, 1]), tensor([2, 3, 4]))
     """
-    newest = None
+    newest, streams = None, 1
     if isinstance(source, TensorDictBase):
+        if source.batch_dims != 1:
+            raise ValueError(
+                f"the data have the batch size {list(source.batch_size)}, expected "
+                "[T]: flatten them with reshape(-1), and give each environment its own "
+                "trajectory ids"
+            )
         data, length = source, len(source)
     else:
         storage = source.storage if isinstance(source, ReplayBuffer) else source
-        data, length = storage_data(storage), len(storage)
-        if storage.ndim != 1:
+        data, length = storage_rows(storage), len(storage)
+        if length and not is_in_order_of_time(source):
             raise ValueError(
-                f"the storage has ndim={storage.ndim}, expected 1: store flat "
-                "transitions, with trajectory ids"
+                "the buffer's writer replaces rows at any place, so that its rows are "
+                "not in the order of time: use a round-robin writer"
             )
         newest = last_written(source)
+        streams = storage.shape[1:].numel() if storage.ndim > 1 else 1
     ids, done = _leaves(data, length, trajectory_key, done_key)
-    # Only in a full ring does a trajectory continue from the last row to the first.
-    is_ring = length == data.shape[0] and newest is not None and newest < length - 1
+    steps = length // streams
+    # Only in a full ring does time begin after the row that was written last.
+    is_ring = length == data.shape[0] and newest is not None and newest < steps - 1
     oldest = newest + 1 if is_ring and newest is not None else 0
+    # Whether each row, in the order of environment and time, is the last of a piece,
+    # that is of consecutive rows of one trajectory; and whether its trajectory ends.
     leaf = done if ids is None else ids
     assert leaf is not None  # _leaves returns at least one
-    last = torch.zeros(length, dtype=torch.bool, device=leaf.device)
-    if ids is not None:
-        ids = ids.roll(-oldest) if oldest else ids
-        last[:-1] = ids[1:] != ids[:-1]
+    ended = torch.zeros(length, dtype=torch.bool, device=leaf.device)
     if done is not None:
-        last |= done.roll(-oldest) if oldest else done
-    last[-1] = True
-    if newest is not None and newest < length:
-        last[(newest - oldest) % length] = True
+        ended |= _in_time(done, streams, oldest)
+    ended.view(streams, steps)[:, -1] = True
+    if newest is not None and newest < steps:
+        ended.view(streams, steps)[:, (newest - oldest) % steps] = True
+    last = ended
+    if ids is not None:
+        ids = _in_time(ids, streams, oldest)
+        last = ended.clone()
+        last[:-1] |= ids[1:] != ids[:-1]
     ends = last.nonzero()[:, 0]
     dtype = torch.int32 if length < 1 << 31 else torch.int64
-    left = ends.to(dtype).repeat_interleave(ends.diff(prepend=ends.new_tensor([-1])))
-    for start in range(0, length, _CHUNK):
-        part = left[start : start + _CHUNK]
-        part -= torch.arange(start, start + len(part), dtype=dtype, device=left.device)
-    return TrajectoryIndex(length, oldest, ends, left.roll(oldest) if oldest else left)
+    pieces = None
+    if ids is not None:
+        pieces = _joined(ids[ends], ended[ends], ends, steps)
+    if pieces is None and streams == 1:
+        return _index(length, oldest, ends, dtype)
+    if pieces is None:
+        place = torch.arange(length, dtype=dtype, device=ends.device)
+    else:
+        order, lengths, ends = pieces
+        place = _ranges(order, lengths).to(dtype)
+    # From places in the order of environment and time to rows of the storage.
+    row = place if streams == 1 else place % steps
+    row = (row + oldest) % steps
+    if streams > 1:
+        row = row * streams + torch.div(place, steps, rounding_mode="floor")
+    position = torch.empty_like(row)
+    position[row.long()] = torch.arange(length, dtype=dtype, device=row.device)
+    found = _index(length, 0, ends, dtype)
+    return TrajectoryIndex(
+        length, oldest * streams, ends, _picked(found.left, position), row, position
+    )
+
+
+def flat_rows(
+    index: torch.Tensor | tuple[torch.Tensor, ...], storage: TensorStorage
+) -> torch.Tensor:
+    """Returns the rows that a sampler drew, as :class:`TrajectoryIndex` counts them.
+
+    Args:
+        index (torch.Tensor or tuple of torch.Tensor): rows ``[B]``, or the coordinates
+            ``[B]`` in each dimension of the storage.
+        storage (TensorStorage): the sampled storage.
+
+    Returns:
+        torch.Tensor: int64 ``[B]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> from torchrl_caiac.trajectories import flat_rows
+        >>> storage = LazyTensorStorage(12, ndim=2)
+        >>> storage.set(range(2), TensorDict({"a": torch.zeros(2, 3)}, [2, 3]))
+        >>> flat_rows((torch.tensor([1, 0]), torch.tensor([2, 1])), storage)
+        tensor([5, 1])
+    """
+    if isinstance(index, torch.Tensor):
+        return index.reshape(-1)
+    if len(index) == 1:
+        return index[0].reshape(-1)
+    rows = torch.zeros_like(index[0])
+    for coordinate, size in zip(index, storage.shape, strict=True):
+        rows = rows * size + coordinate
+    return rows.reshape(-1)
 
 
 class TrajectoryCache:
@@ -225,6 +329,82 @@ def _new_cache(
     return TrajectoryCache(trajectory_key=trajectory_key, done_key=done_key)
 
 
+def _picked(source: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    """Returns ``source[where]``, int64, in the shape of ``where``."""
+    found = source.index_select(0, where.to(source.device).reshape(-1))
+    return found.view(where.shape).long()
+
+
+def _in_time(leaf: torch.Tensor, streams: int, oldest: int) -> torch.Tensor:
+    """Returns the values of rows ``[T]`` in the order of environment and time."""
+    if streams > 1:
+        leaf = leaf.view(-1, streams).t()
+        return (leaf.roll(-oldest, 1) if oldest else leaf).reshape(-1)
+    return leaf.roll(-oldest) if oldest else leaf
+
+
+def _index(
+    length: int, oldest: int, ends: torch.Tensor, dtype: torch.dtype
+) -> TrajectoryIndex:
+    """Returns the index of trajectories that lie one after another."""
+    left = torch.empty(length, dtype=dtype, device=ends.device)
+    for start in range(0, length, _CHUNK):  # in parts, to need no memory but the index
+        position = torch.arange(start, min(start + _CHUNK, length), device=ends.device)
+        end = ends[torch.searchsorted(ends, position)]
+        left[(position + oldest) % length] = (end - position).to(dtype)
+    return TrajectoryIndex(length, oldest, ends, left)
+
+
+def _joined(
+    ids: torch.Tensor, is_final: torch.Tensor, ends: torch.Tensor, steps: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None:
+    """Joins pieces of the same trajectory.
+
+    Args:
+        ids (torch.Tensor): ``[P]``, the id of each piece, in the order of environment
+            and time.
+        is_final (torch.Tensor): bool ``[P]``, whether its trajectory ends with it.
+        ends (torch.Tensor): int64 ``[P]``, the place of its last row.
+        steps (int): the rows of each environment.
+
+    Returns:
+        tuple of torch.Tensor, optional: the places of the first rows of the pieces and
+        their lengths, trajectory by trajectory, ``[P]``, and the positions of the ends
+        of trajectories, ``[E]``; ``None`` if every piece is a whole trajectory.
+    """
+    count = len(ids)
+    # Pieces of an id in the order of time, and ids by environment.
+    by_id = ids.argsort(stable=True)
+    if count > 1 and len(ends) and int(ends[-1]) + 1 > steps:
+        stream = torch.div(ends, steps, rounding_mode="floor")
+        by_id = by_id[stream[by_id].argsort(stable=True)]
+        same = stream[by_id][1:] == stream[by_id][:-1]
+    else:
+        same = torch.ones(count - 1, dtype=torch.bool, device=ids.device)
+    same &= (ids[by_id][1:] == ids[by_id][:-1]) & ~is_final[by_id][:-1]
+    if not bool(same.any()):
+        return None
+    begins = torch.cat([same.new_ones(1), ~same])
+    number = begins.cumsum(0) - 1
+    # Trajectories in the order of their first rows.
+    first = by_id[begins]
+    rank = torch.empty_like(first)
+    rank[first.argsort()] = torch.arange(len(first), device=first.device)
+    order = by_id[rank[number].argsort(stable=True)]
+    lengths = ends.diff(prepend=ends.new_tensor([-1]))
+    starts = ends - lengths + 1
+    sizes = torch.zeros(len(first), dtype=torch.long, device=ids.device)
+    sizes.index_add_(0, rank[number], lengths[by_id])
+    return starts[order], lengths[order], sizes.cumsum(0) - 1
+
+
+def _ranges(starts: torch.Tensor, lengths: torch.Tensor) -> torch.Tensor:
+    """Returns consecutive numbers from each start, int64 ``[sum(lengths)]``."""
+    shift = starts - (lengths.cumsum(0) - lengths)
+    total = int(lengths.sum())
+    return shift.repeat_interleave(lengths) + torch.arange(total, device=starts.device)
+
+
 def _leaves(
     data: TensorDictBase,
     length: int,
@@ -237,11 +417,11 @@ def _leaves(
             "trajectory_key and done_key are both None: give at least one of them, "
             "since it marks where trajectories end"
         )
-    ids = done = None
+    ids = None
     if trajectory_key is not None:
         ids = data.get(trajectory_key, None)
         if ids is None:
-            ids = data.get(_COLLECTOR_KEY, None)
+            ids = data.get(COLLECTOR_KEY, None)
         if ids is None:
             raise missing_key(
                 data,
@@ -252,19 +432,35 @@ def _leaves(
                 "of each trajectory are consecutive (transforms take it as "
                 "keys=TransformKeys(trajectory=...))",
             )
-    if done_key is not None:
-        done = data.get(done_key, None)
-        if done is None and ids is None:
-            raise missing_key(
-                data,
-                done_key,
-                "the transitions lack the end flags",
-                "pass done_key= with the key of the flags",
-            )
-    return (
-        None if ids is None else _flat(ids, length, trajectory_key),
-        None if done is None else _flat(done, length, done_key).bool(),
-    )
+        ids = _flat(ids, length, trajectory_key)
+    done = None if done_key is None else _end_flags(data, length, done_key)
+    if done_key is not None and done is None and ids is None:
+        raise missing_key(
+            data,
+            done_key,
+            "the transitions lack the end flags",
+            "pass done_key= with the key of the flags",
+        )
+    return ids, done
+
+
+def _end_flags(
+    data: TensorDictBase, length: int, done_key: NestedKey
+) -> torch.Tensor | None:
+    """Returns where a trajectory ends, bool ``[T]``, ``None`` if the data lack it."""
+    found = data.get(done_key, None)
+    done = None if found is None else _flat(found, length, done_key).bool()
+    if found is None:
+        parents = path(done_key)[:-1]
+        for name in _PARTS_OF_DONE:
+            part = data.get((*parents, name), None)
+            if part is not None:
+                flags = _flat(part, length, (*parents, name)).bool()
+                done = flags if done is None else done | flags
+    steps = data.get(STEPS_KEY, None)
+    if done is not None and steps is not None:
+        done = done & (_flat(steps, length, STEPS_KEY) == 1)
+    return done
 
 
 def _flat(leaf: torch.Tensor, length: int, key: NestedKey | None) -> torch.Tensor:

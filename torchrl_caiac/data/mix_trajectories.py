@@ -47,7 +47,7 @@ def mix_trajectories(
     prefix has the given shares as exactly as whole trajectories allow. The mixture is a
     prefix of this order, whose length is ``fraction * trajectories``. Hence, of two
     mixtures with the same sources, shares and seed, the smaller one is a prefix of the
-    larger one. The rows of a trajectory keep their order.
+    larger one. The rows of a trajectory become consecutive, in the order of time.
 
     The result has the leaves of the sources, and:
 
@@ -58,8 +58,8 @@ def mix_trajectories(
 
     Args:
         sources (sequence of TensorDictBase): transitions ``[T]``, in memory or
-            memory-mapped, with the same keys, dtypes and shapes after ``T``. The rows
-            of a trajectory are consecutive.
+            memory-mapped, with the same keys, dtypes and shapes after ``T``. For the
+            trajectories see :func:`~torchrl_caiac.trajectories.trajectory_index`.
 
     Keyword Args:
         shares (sequence of float, optional): the share of each source in the
@@ -85,9 +85,9 @@ def mix_trajectories(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         KeyError: a source lacks ``trajectory_key``.
-        ValueError: the sources have different leaves, none, or trajectories whose rows
-            are not consecutive; ``shares``, ``fraction`` or ``trajectories`` are out of
-            range or need more trajectories than the sources have.
+        ValueError: the sources have different leaves or none; ``shares``, ``fraction``
+            or ``trajectories`` are out of range or need more trajectories than the
+            sources have.
 
     Examples:
         >>> import torch
@@ -214,11 +214,16 @@ def _locate(indices: Sequence[TrajectoryIndex], picks: np.ndarray) -> _Rows:
     starts, lengths = torch.empty_like(source), torch.empty_like(source)
     for position, index in enumerate(indices):
         own = source == position
-        starts[own] = index.starts.cpu()[trajectory[own]]
         lengths[own] = index.lengths.cpu()[trajectory[own]]
+        starts[own] = (index.ends - index.lengths + 1).cpu()[trajectory[own]]
     number = torch.arange(len(source)).repeat_interleave(lengths)
-    step = torch.arange(len(number)) - (lengths.cumsum(0) - lengths)[number]
-    return _Rows(number, source[number], starts[number] + step)
+    place = torch.arange(len(number)) - (lengths.cumsum(0) - lengths)[number]
+    place += starts[number]
+    rows, row_source = torch.empty_like(place), source[number]
+    for position, index in enumerate(indices):
+        own = row_source == position
+        rows[own] = index.rows(place[own].to(index.device)).cpu()
+    return _Rows(number, row_source, rows)
 
 
 def _fill(
@@ -247,24 +252,16 @@ def _fill(
 def _index(
     source: TensorDictBase, trajectory_key: NestedKey, number: int
 ) -> TrajectoryIndex:
-    ids = get_leaf(
+    get_leaf(
         source,
         trajectory_key,
         f"source {number} lacks the trajectory ids",
         "pass trajectory_key=",
     )
     try:
-        index = trajectory_index(source, trajectory_key=trajectory_key, done_key=None)
+        return trajectory_index(source, trajectory_key=trajectory_key, done_key=None)
     except ValueError as error:
         raise ValueError(f"source {number}: {error}") from error
-    names, pieces = ids.reshape(-1)[index.starts].unique(return_counts=True)
-    if (pieces > 1).any():
-        raise ValueError(
-            f"the rows of trajectory {names[pieces > 1][0].item()} of source {number} "
-            f"are not consecutive: sort them, or give each part its own id in "
-            f"{trajectory_key!r}"
-        )
-    return index
 
 
 def _check_sources(sources: Sequence[TensorDictBase], new: Sequence[NestedKey]) -> None:

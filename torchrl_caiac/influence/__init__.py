@@ -5,7 +5,6 @@ from __future__ import annotations
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.distance import DistanceInfluence
-from torchrl_caiac.influence.mark_unscored import MarkUnscored, set_unscored
 from torchrl_caiac.influence.metrics import (
     EntityReport,
     best_threshold,
@@ -27,7 +26,6 @@ __all__ = [
     "AttentionInfluence",
     "DistanceInfluence",
     "EntityReport",
-    "MarkUnscored",
     "SimulatorInfluence",
     "TrueInfluence",
     "best_threshold",
@@ -37,6 +35,5 @@ __all__ = [
     "roc_auc",
     "score_buffer",
     "score_file",
-    "set_unscored",
     "true_influence",
 ]

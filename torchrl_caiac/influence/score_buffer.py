@@ -2,41 +2,51 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import ReplayBuffer
+from torchrl.data import ReplayBuffer, TensorStorage
 from tqdm.auto import tqdm
 
+from torchrl_caiac._files import claim_folder
 from torchrl_caiac._keys import as_key, jsonable
 from torchrl_caiac._torchrl import (
     add_revision,
     drop_prefetched,
     known_to_be_memmap,
+    memmap_folder,
     storage_data,
+    storage_rows,
 )
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence.mark_unscored import mark_later_rows
 from torchrl_caiac.influence.score_leaf import (
-    all_nan,
-    check_leaf,
-    find_leaf,
-    new_leaf,
+    ScoreLeaves,
+    check_shape,
+    find_leaves,
+    new_leaves,
+    row_states,
 )
 from torchrl_caiac.influence.score_record import (
     estimator_digest,
     layout_digest,
     read_record,
+    settings_digest,
     settings_that_differ,
     write_record,
 )
 from torchrl_caiac.influence.scorer import Scorer
-from torchrl_caiac.trajectories import trajectory_index
+from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
 __all__ = ["score_buffer"]
+
+_logger = logging.getLogger("torchrl_caiac.influence.score_buffer")
+# Passes over a buffer that others write to, before rows are left unscored.
+_MOST_PASSES = 10
 
 
 @torch.no_grad()
@@ -81,29 +91,35 @@ def score_buffer(
     gets the score of that one.
 
     The leaf is float32 ``[T, N]`` (``[T, N + 1, N]`` for graphs), NaN where a row is
-    not scored. The rows are scored in chunks of ``batch_size``. An interrupted call
-    resumes where it stopped when it is repeated, and ends with the same bytes as an
-    uninterrupted one. This function appends a
-    :class:`~torchrl_caiac.influence.MarkUnscored` to the buffer, which marks rows that
-    are written later as not scored. The next call scores them, and the rows around them
-    whose windows they are in. Time is linear in the number of rows. The index of
-    trajectories takes 4 bytes of memory for each row; the rest does not grow with the
-    number of rows or the length of trajectories.
+    not scored. Beside it, in ``("caiac", "score_fingerprint")`` for the default key,
+    each row has a fingerprint of its state, its next state and the settings, int64
+    ``[T]``. So a score is used only for the state that it was computed from, whoever
+    writes to the buffer, and in whatever process: the transforms compare the
+    fingerprints of every batch, and the next call of this function scores the rows
+    whose states have changed, and those around them whose windows they are in.
+    Rows that are written while this function runs are scored in another pass.
 
-    A record of how the scores were computed (a digest of the estimator's state, its
-    ``repr`` and its layout, ``smoothing``, ``lookahead``, ``every`` and the keys) is
-    kept on the storage object, or, for a memory-mapped storage with a folder, in the
-    file that :func:`~torchrl_caiac.influence.score_file` names. Scores
-    with different settings are never mixed. ``batch_size`` may change between calls;
-    scores then agree up to rounding. ``rb.dumps`` saves the scores without the file.
+    The rows are scored in chunks of ``batch_size``. An interrupted call resumes where
+    it stopped when it is repeated, and a first call ends with the same bytes as an
+    uninterrupted one. Time is linear in the number of rows. Apart from the index of
+    trajectories and a few bytes for each row, memory does not grow with the number of
+    rows or the length of trajectories.
 
-    Nothing may be sampled or written while this function runs. Open data in a folder
-    with :func:`torchrl_caiac.data.load_transitions`, which detects truncated files.
+    Both leaves are saved and loaded with the buffer, by ``dumps``, ``state_dict`` or
+    TorchRL's checkpoints. A record of how the scores were computed (a digest of the
+    estimator's state, its ``repr`` and its layout, ``smoothing``, ``lookahead``,
+    ``every`` and the keys) is kept on the storage object, or, for a memory-mapped
+    storage with a folder, in the file that :func:`~torchrl_caiac.influence.score_file`
+    names. Scores with different settings are never mixed. ``batch_size`` may change
+    between calls; scores then agree up to rounding.
+
+    One process at a time may score a folder. Open data in a folder with
+    :func:`torchrl_caiac.data.load_transitions`, which detects truncated files.
 
     Args:
-        rb (ReplayBuffer): a buffer with a one-dimensional storage of tensordicts, full
-            or not. The rows of a trajectory are next to each other, in the order of
-            time.
+        rb (ReplayBuffer): a buffer with a storage of tensordicts, ``[T]`` or
+            ``[T, *B]``, full or not. See
+            :func:`~torchrl_caiac.trajectories.trajectory_index` for its trajectories.
         estimator (callable): maps states, a tensordict ``[n]``, to scores ``[n, N]``
             (or ``[n, N + 1, N]``), each row independently. It, or its ``model``, has
             the ``layout`` (:class:`EntityLayout`) that the scores follow. It gets the
@@ -117,8 +133,9 @@ def score_buffer(
 
     Keyword Args:
         key (NestedKey): the leaf to write. Defaults to ``("caiac", "score")``.
-        lookahead (int): the number of later states in the maximum of a row. Defaults to
-            1.
+        lookahead (int): the number of later states in the maximum of a row, at least
+            the ``steps_to_next_obs`` of :class:`~torchrl.envs.MultiStepTransform`.
+            Defaults to 1.
         every (int): score only every ``every``-th state of a trajectory. Defaults to 1:
             all states.
         trajectory_key (NestedKey, optional): the trajectory ids, see
@@ -133,10 +150,11 @@ def score_buffer(
     Raises:
         TypeError: ``rb`` is not a replay buffer, its storage contains no tensordict, or
             the estimator has no layout.
-        ValueError: the buffer is empty or its storage has several dimensions; an
-            observation or a score is not finite; the estimator's output has another
-            shape; the leaf or the score file has another origin, or the scores have
-            other settings; ``every`` is above 1 and old rows were overwritten.
+        ValueError: the buffer is empty; an observation or a score is not finite; the
+            estimator's output has another shape; the leaf or the score file has another
+            origin, or the scores have other settings; ``every`` is above 1 and old rows
+            were overwritten; ``lookahead`` is below the steps to the next states.
+        RuntimeError: another process is scoring the folder.
         KeyError: the storage lacks a key.
 
     Examples:
@@ -176,63 +194,195 @@ def score_buffer(
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     key, storage = as_key(key), rb.storage
-    index = trajectory_index(rb, trajectory_key=trajectory_key, done_key=done_key)
-    data = storage_data(storage)
-    known_to_be_memmap(data)
+    known_to_be_memmap(storage_data(storage))
     layout = _layout_of(estimator)
-    if every > 1 and index.oldest:
-        raise ValueError(
-            f"every is {every}, but the oldest rows of the buffer were overwritten, so "
-            "that trajectories lack their first states: use every=1"
-        )
-    scorer = Scorer(
-        data,
-        estimator,
-        layout,
-        index,
-        batch_size=batch_size,
-        smoothing=smoothing,
-        lookahead=lookahead,
-        every=every,
-    )
     settings = {
         "estimator": estimator_digest(estimator),
         "layout": layout_digest(layout),
         "smoothing": smoothing,
         "lookahead": lookahead,
+        "every": every,
         "trajectory_key": jsonable(trajectory_key),
         "done_key": jsonable(done_key),
     }
-    if every > 1:  # not in records of earlier versions
-        settings["every"] = every
-    leaf = find_leaf(data, key)
-    record = None if overwrite else read_record(storage, data, key)
-    if not overwrite and leaf is not None:
-        # Rows that have not been written do not matter.
-        written = leaf[: index.length]
-        if record is not None and record["state"] == "new":
-            overwrite = True  # interrupted before the leaf was filled with NaN
-        else:
-            check_leaf(leaf, key, data, layout)
-            overwrite = not _can_keep(written, record, settings, key, batch_size)
-    if leaf is None or overwrite:
+    is_prepared = False
+    for number in range(_MOST_PASSES):
+        index = trajectory_index(rb, trajectory_key=trajectory_key, done_key=done_key)
+        if every > 1 and index.oldest:
+            raise ValueError(
+                f"every is {every}, but the oldest rows of the buffer were "
+                "overwritten, so that trajectories lack their first states: use "
+                "every=1"
+            )
+        data = storage_rows(storage)
+        _check_steps(data, index.length, lookahead)
+        scorer = Scorer(
+            data,
+            estimator,
+            layout,
+            index,
+            batch_size=batch_size,
+            smoothing=smoothing,
+            lookahead=lookahead,
+            every=every,
+            settings=settings_digest(settings),
+            is_prepared=is_prepared,
+        )
+        is_done = _one_pass(
+            storage,
+            data,
+            index,
+            scorer,
+            layout,
+            key,
+            settings,
+            overwrite=overwrite and not number,
+            progress=progress,
+        )
+        if is_done:
+            break
+        is_prepared = scorer.is_prepared
+    else:
+        _logger.warning(
+            "the buffer was written to during all of %d passes, so that some rows are "
+            "not scored: call score_buffer again, or sample with unscored='keep'",
+            _MOST_PASSES,
+        )
+    # Prefetched batches lack the leaf, or have it unscored.
+    drop_prefetched(rb)
+
+
+def _one_pass(
+    storage: TensorStorage,
+    data: TensorDictBase,
+    index: TrajectoryIndex,
+    scorer: Scorer,
+    layout: EntityLayout,
+    key: NestedKey,
+    settings: dict[str, Any],
+    *,
+    overwrite: bool,
+    progress: bool,
+) -> bool:
+    """Scores all rows without a valid score; returns whether there were none."""
+    leaves, is_first = None, True
+    if not overwrite:
+        leaves, is_first = _existing(storage, data, index.length, layout, key, settings)
+    if leaves is None:
         # Score the first block before anything is written: an estimator or data that
         # do not fit leave the storage unchanged.
-        feature_shape = tuple(scorer.block(0)[0].shape[1:])
-        write_record(storage, data, key, settings, layout, "new")
-        leaf = new_leaf(storage, data, key, feature_shape)
-        todo = list(range(scorer.num_chunks))
+        feature_shape = tuple(scorer.block(0).state.shape[1:])
+        with _claimed(data):
+            write_record(storage, data, key, settings, layout, "new")
+            leaves = new_leaves(storage, key, feature_shape)
+            write_record(storage, data, key, settings, layout, "scoring")
+            stale = torch.ones(index.length, dtype=torch.bool)
+            _score(scorer, index, leaves, stale, is_first=True, progress=progress)
+            write_record(storage, data, key, settings, layout, "scored")
     else:
-        feature_shape = scorer.feature_shape = tuple(leaf.shape[1:])
-        todo = [c for c in range(scorer.num_chunks) if scorer.is_stale(c, leaf)]
-        for c in todo:
-            # A row whose neighbors changed counts as unscored, so that it is found
-            # again if this call is interrupted.
-            leaf[scorer.span(c)] = torch.nan
-    write_record(storage, data, key, settings, layout, "scored")
-    mark_later_rows(rb, key, feature_shape)
-    spans = [scorer.span(c) for c in todo]
-    left = sum(span.stop - span.start for span in spans)
+        scorer.feature_shape = tuple(leaves.scores.shape[1:])
+        stale = ~row_states(
+            data, leaves, layout, index.length, settings_digest(settings)
+        )[0]
+        if not bool(stale.any()):
+            return True
+        every_position = torch.arange(index.length, device=index.device)
+        stale = stale[index.rows(every_position).cpu()]
+        with _claimed(data):
+            write_record(storage, data, key, settings, layout, "scoring")
+            _score(scorer, index, leaves, stale, is_first=is_first, progress=progress)
+            write_record(storage, data, key, settings, layout, "scored")
+    add_revision(storage)
+    return False
+
+
+def _existing(
+    storage: TensorStorage,
+    data: TensorDictBase,
+    length: int,
+    layout: EntityLayout,
+    key: NestedKey,
+    settings: dict[str, Any],
+) -> tuple[ScoreLeaves | None, bool]:
+    """Returns leaves to keep, and whether their first pass was interrupted.
+
+    Raises:
+        ValueError: the scores are of another origin or have other settings.
+    """
+    leaves = find_leaves(storage, key)
+    record = read_record(storage, data, key)
+    if leaves is None or (record is not None and record["state"] == "new"):
+        return None, True  # none, or interrupted before the leaves were initialized
+    check_shape(leaves, key, layout)
+    # Leaves without scores may have been created with the first write to the buffer.
+    if leaves.fingerprints is None:
+        if leaves.all_nan(length):
+            return None, True
+        raise ValueError(
+            f"the storage has scores in {key!r} without fingerprints of their states "
+            "(by another program, or an earlier version): call "
+            "score_buffer(..., overwrite=True) to replace them, or give another key"
+        )
+    has_others = row_states(data, leaves, layout, length, settings_digest(settings))[1]
+    if has_others:
+        differences = "see the settings of the earlier call"
+        if record is not None:
+            differences = settings_that_differ(record["settings"], settings)
+        raise ValueError(
+            f"the scores in {key!r} have other settings: {differences}. Call "
+            "score_buffer(..., overwrite=True) to recompute them, or give another key"
+        )
+    return leaves, record is not None and record["state"] == "scoring"
+
+
+def _score(
+    scorer: Scorer,
+    index: TrajectoryIndex,
+    leaves: ScoreLeaves,
+    stale: torch.Tensor,
+    *,
+    is_first: bool,
+    progress: bool,
+) -> None:
+    """Scores stale rows, and the rows whose scores depend on them.
+
+    Args:
+        scorer (Scorer): computes the scores.
+        index (TrajectoryIndex): the trajectories.
+        leaves (ScoreLeaves): where they are written.
+        stale (torch.Tensor): bool ``[T]`` by position.
+
+    Keyword Args:
+        is_first (bool): whether chunks are scored as a whole, so that an interrupted
+            first pass ends with the same bytes as an uninterrupted one.
+        progress (bool): show a progress bar.
+    """
+    scores, known = leaves
+    assert known is not None
+    before, after = scorer.reach
+    # In a ring, the oldest row has lost the row before it to the newest one.
+    is_ring = index.order is None and index.length == len(scores)
+    todo = []
+    left = 0
+    for c in range(scorer.num_chunks):
+        span = scorer.span(c)
+        near = torch.arange(span.start - before, span.stop + after)
+        near = near % index.length if is_ring else near.clamp(0, index.length - 1)
+        # Whether there is a stale row around each one.
+        counts = stale[near].long().cumsum(0)
+        counts = torch.cat([counts.new_zeros(1), counts])
+        size = before + after + 1
+        is_near = counts[size:] > counts[:-size]
+        if not bool(is_near.any()):
+            continue
+        if is_first:
+            is_near[:] = True
+        rows = scorer.rows(c)[is_near]
+        # A row whose neighbors changed counts as unscored, so that it is found again
+        # if this call is interrupted.
+        known[rows.to(known.device)] = 0
+        todo.append((c, is_near))
+        left += len(rows)
     with tqdm(
         total=index.length,
         initial=index.length - left,
@@ -240,13 +390,38 @@ def score_buffer(
         unit="row",
         disable=not progress or not todo,
     ) as bar:
-        for c, span in zip(todo, spans, strict=True):
-            scores = scorer.chunk(c)
-            leaf[span] = scores.to(leaf.device)
-            bar.update(len(scores))
-    add_revision(storage)
-    # Prefetched batches lack the leaf, or have it unscored.
-    drop_prefetched(rb)
+        for c, is_near in todo:
+            rows = scorer.rows(c)[is_near]
+            if bool(is_near.all()):
+                found, fingerprints = scorer.chunk(c)
+            else:
+                chosen = is_near.nonzero()[:, 0] + scorer.span(c).start
+                found, fingerprints = scorer.some(chosen)
+            rows = rows.to(scores.device)
+            # The fingerprints last: without them the scores do not count.
+            scores[rows] = found.to(scores.device)
+            known[rows] = fingerprints.to(known.device)
+            bar.update(len(rows))
+
+
+def _check_steps(data: TensorDictBase, length: int, lookahead: int) -> None:
+    """Raises if next states are farther away than the lookahead."""
+    steps = data.get(STEPS_KEY, None)
+    if steps is None:
+        return
+    most = int(steps[:length].max())
+    if most > lookahead:
+        raise ValueError(
+            f"the next states are up to {most} steps later, see {STEPS_KEY!r}, but "
+            f"lookahead is {lookahead}: an entity that is influenced in between would "
+            f"count as uninfluenced. Use lookahead={most} or more"
+        )
+
+
+def _claimed(data: TensorDictBase) -> AbstractContextManager[None]:
+    """Locks the folder of memory-mapped data, so that one process scores it."""
+    folder = memmap_folder(data) if data.is_memmap() else None
+    return nullcontext() if folder is None else claim_folder(folder)
 
 
 def _layout_of(estimator: Any) -> EntityLayout:
@@ -259,32 +434,6 @@ def _layout_of(estimator: Any) -> EntityLayout:
             "the EntityLayout that its scores follow"
         )
     return layout
-
-
-def _can_keep(
-    written: torch.Tensor,
-    record: dict[str, Any] | None,
-    settings: dict[str, Any],
-    key: NestedKey,
-    batch_size: int,
-) -> bool:
-    """Returns whether existing scores have these settings; raises otherwise."""
-    if record is not None and record["settings"] == settings:
-        return True
-    # A leaf without scores may come from a transform that was there at the first write.
-    if all_nan(written, batch_size):
-        return False
-    if record is None:
-        raise ValueError(
-            f"the storage has scores in {key!r} without a record of how they were "
-            "computed (by another program, or loaded from another folder): call "
-            "score_buffer(..., overwrite=True), or give another key"
-        )
-    raise ValueError(
-        f"the scores in {key!r} have other settings: "
-        f"{settings_that_differ(record['settings'], settings)}. Call "
-        "score_buffer(..., overwrite=True) to recompute them, or give another key"
-    )
 
 
 def _check_int(name: str, value: int, least: int) -> None:

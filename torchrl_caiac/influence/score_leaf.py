@@ -1,10 +1,11 @@
-"""The leaf of a storage that contains the scores."""
+"""The leaves of a storage that contain the scores and their fingerprints."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -12,26 +13,60 @@ from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 
 from torchrl_caiac._files import write_json
+from torchrl_caiac._fingerprints import (
+    fingerprint_key,
+    is_fingerprint_of,
+    settings_of,
+    state_hash,
+)
 from torchrl_caiac._keys import path
-from torchrl_caiac._torchrl import drop_memmap_leaf, forget_leaves, memmap_folder
+from torchrl_caiac._torchrl import (
+    drop_memmap_leaf,
+    forget_leaves,
+    memmap_folder,
+    storage_data,
+    storage_rows,
+)
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["all_nan", "check_leaf", "find_leaf", "new_leaf"]
+__all__ = ["ScoreLeaves", "check_shape", "find_leaves", "new_leaves", "row_states"]
+
+_CHUNK = 1 << 16
 
 
-def find_leaf(data: TensorDictBase, key: NestedKey) -> torch.Tensor | None:
-    """Returns the score leaf, ``None`` where there is none.
+class ScoreLeaves(NamedTuple):
+    """The scores of all rows of a storage, views of its leaves.
+
+    Attributes:
+        scores (torch.Tensor): float32 ``[capacity, *feature_shape]``, NaN where a row
+            was not scored.
+        fingerprints (torch.Tensor, optional): int64 ``[capacity]``; ``None`` for scores
+            that :func:`~torchrl_caiac.influence.score_buffer` did not write.
+    """
+
+    scores: torch.Tensor
+    fingerprints: torch.Tensor | None
+
+    def all_nan(self, length: int) -> bool:
+        """Returns whether none of the first ``length`` rows has a score."""
+        parts = self.scores[:length].split(_CHUNK)
+        return all(bool(part.isnan().all()) for part in parts)
+
+
+def find_leaves(storage: TensorStorage, key: NestedKey) -> ScoreLeaves | None:
+    """Returns the leaves of a storage's scores, ``None`` where there are none.
 
     Args:
-        data (TensorDictBase): the rows of the storage, ``[capacity]``.
+        storage (TensorStorage): the storage.
         key (NestedKey): the score leaf.
 
     Returns:
-        torch.Tensor, optional: the leaf, ``[capacity, ...]``.
+        ScoreLeaves, optional: the leaves.
 
     Raises:
         ValueError: ``key`` is another entry, or below a tensor.
     """
+    data = storage_rows(storage)
     parts = path(key)
     for depth in range(1, len(parts)):
         if isinstance(data.get(parts[:depth], None), torch.Tensor):
@@ -40,30 +75,39 @@ def find_leaf(data: TensorDictBase, key: NestedKey) -> torch.Tensor | None:
                 "below it: give another key"
             )
     leaf = data.get(key, None)
-    if leaf is not None and not isinstance(leaf, torch.Tensor):
+    if leaf is None:
+        return None
+    if not isinstance(leaf, torch.Tensor):
         raise ValueError(
             f"{key!r} is a {type(leaf).__name__} in the storage: give another key"
         )
-    return leaf
+    known = data.get(fingerprint_key(key), None)
+    if known is not None and (known.dtype, known.numel()) != (torch.int64, len(data)):
+        raise ValueError(
+            f"{fingerprint_key(key)!r} is {known.dtype} {list(known.shape)}, expected "
+            f"torch.int64 {[len(data)]}: it was written by something else. Remove it, "
+            "or give another key"
+        )
+    return ScoreLeaves(
+        leaf.as_subclass(torch.Tensor),
+        None if known is None else known.as_subclass(torch.Tensor).reshape(-1),
+    )
 
 
-def check_leaf(
-    leaf: torch.Tensor, key: NestedKey, data: TensorDictBase, layout: EntityLayout
-) -> None:
-    """Raises if a leaf cannot contain the scores of a layout's entities.
+def check_shape(leaves: ScoreLeaves, key: NestedKey, layout: EntityLayout) -> None:
+    """Raises if leaves cannot contain the scores of a layout's entities.
 
     Args:
-        leaf (torch.Tensor): the leaf.
-        key (NestedKey): its key.
-        data (TensorDictBase): the rows of the storage, ``[capacity]``.
+        leaves (ScoreLeaves): the leaves.
+        key (NestedKey): the score leaf.
         layout (EntityLayout): the ``N`` entities.
 
     Raises:
-        ValueError: it is not float32, or its shape is neither ``[capacity, N]`` nor
-            ``[capacity, N + 1, N]``.
+        ValueError: the scores are not float32, or their shape is neither
+            ``[capacity, N]`` nor ``[capacity, N + 1, N]``.
     """
-    n = layout.num_entities
-    expected = [(len(data), n), (len(data), n + 1, n)]
+    leaf, n = leaves.scores, layout.num_entities
+    expected = [(len(leaf), n), (len(leaf), n + 1, n)]
     if leaf.dtype != torch.float32 or tuple(leaf.shape) not in expected:
         raise ValueError(
             f"{key!r} is {leaf.dtype} {list(leaf.shape)}, expected torch.float32 "
@@ -73,63 +117,101 @@ def check_leaf(
         )
 
 
-def all_nan(leaf: torch.Tensor, batch_size: int) -> bool:
-    """Returns whether no row has a score.
+def row_states(
+    data: TensorDictBase,
+    leaves: ScoreLeaves,
+    layout: EntityLayout,
+    length: int,
+    settings: int,
+) -> tuple[torch.Tensor, bool]:
+    """Returns which rows have a valid score.
 
     Args:
-        leaf (torch.Tensor): ``[T, ...]``.
-        batch_size (int): rows that are read at a time.
+        data (TensorDictBase): the rows of the storage, ``[capacity]``.
+        leaves (ScoreLeaves): the leaves, with fingerprints.
+        layout (EntityLayout): the entities.
+        length (int): the number of rows in use, ``T``.
+        settings (int): the settings of the scores, 32 bits.
 
     Returns:
-        bool: whether all values are NaN.
+        tuple of torch.Tensor and bool: bool ``[T]`` on the CPU; and whether a row has a
+        score of its state with other settings.
     """
-    return all(bool(part.isnan().all()) for part in leaf.split(batch_size))
+    scores, known = leaves
+    assert known is not None
+    keys = layout.in_keys
+    next_keys = [layout.next(key) for key in keys]
+    hashed = data.select(*keys, *next_keys, strict=False)
+    is_good = torch.zeros(length, dtype=torch.bool)
+    has_others = False
+    for start in range(0, length, _CHUNK):
+        rows = slice(start, min(start + _CHUNK, length))
+        part = hashed[rows]
+        state, after = state_hash(part, keys), state_hash(part, next_keys)
+        assert state is not None  # the layout was checked
+        is_scored = is_fingerprint_of(known[rows], state, after)
+        is_scored &= ~scores[rows].flatten(1).isnan().any(1)
+        is_own = settings_of(known[rows], state, after) == settings & 0xFFFFFFFF
+        has_others = has_others or bool((is_scored & ~is_own).any())
+        is_good[rows] = (is_scored & is_own).cpu()
+    return is_good, has_others
 
 
-def new_leaf(
-    storage: TensorStorage,
-    data: TensorDictBase,
-    key: NestedKey,
-    feature_shape: tuple[int, ...],
-) -> torch.Tensor:
-    """Adds a score leaf in which no row is scored.
+def new_leaves(
+    storage: TensorStorage, key: NestedKey, feature_shape: tuple[int, ...]
+) -> ScoreLeaves:
+    """Adds leaves in which no row is scored.
 
-    An existing leaf is reused if its shape and dtype fit, and replaced otherwise.
+    Existing leaves are reused if their shape and dtype fit, and replaced otherwise.
 
     Args:
         storage (TensorStorage): the storage.
-        data (TensorDictBase): its rows, ``[capacity]``.
         key (NestedKey): the score leaf.
         feature_shape (tuple of int): the shape of the scores of a row.
 
     Returns:
-        torch.Tensor: the leaf, float32 NaN ``[capacity, *feature_shape]``.
+        ScoreLeaves: the leaves: scores NaN, fingerprints 0.
 
     Raises:
-        ValueError: the storage is shared between processes and lacks the leaf.
+        ValueError: the storage is shared between processes and lacks the leaves.
     """
-    shape = (len(data), *feature_shape)
+    data = storage_data(storage)
+    batch = data.batch_size[: storage.ndim]
+    _new_leaf(data, fingerprint_key(key), batch, torch.int64).zero_()
+    _new_leaf(data, key, torch.Size([*batch, *feature_shape]), torch.float32).fill_(
+        torch.nan
+    )
+    # The storage filters what is written by a list of keys that it created earlier.
+    forget_leaves(storage)
+    rows = storage_rows(storage)
+    return ScoreLeaves(
+        rows.get(key).as_subclass(torch.Tensor),
+        rows.get(fingerprint_key(key)).as_subclass(torch.Tensor),
+    )
+
+
+def _new_leaf(
+    data: TensorDictBase, key: NestedKey, shape: torch.Size, dtype: torch.dtype
+) -> torch.Tensor:
     leaf = data.get(key, None)
-    if leaf is not None and (tuple(leaf.shape) != shape or leaf.dtype != torch.float32):
+    if leaf is not None and (leaf.shape != shape or leaf.dtype != dtype):
         _remove_leaf(data, key)
         leaf = None
     if leaf is None:
         if data.is_memmap():
-            leaf = data.make_memmap(key, shape=torch.Size(shape), dtype=torch.float32)
+            leaf = data.make_memmap(key, shape=shape, dtype=dtype)
         else:
             if data.is_locked and data.is_shared():
                 raise ValueError(
                     f"the storage is shared with other processes and has no {key!r}: "
-                    "score the buffer before it is shared"
+                    "score the buffer before it is shared, or append ScoreOnWrite to "
+                    "it before it is written to"
                 )
-            leaf = torch.empty(shape, dtype=torch.float32, device=data.device)
+            leaf = torch.empty(shape, dtype=dtype, device=data.device)
             with data.unlock_() if data.is_locked else contextlib.nullcontext():
                 data.set(key, leaf)
             leaf = data.get(key)
-    leaf.fill_(torch.nan)
-    # The storage filters what is written by a list of keys that it created earlier.
-    forget_leaves(storage)
-    return leaf
+    return leaf.as_subclass(torch.Tensor)
 
 
 def _remove_leaf(data: TensorDictBase, key: NestedKey) -> None:

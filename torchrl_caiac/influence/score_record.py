@@ -23,12 +23,14 @@ __all__ = [
     "layout_digest",
     "read_record",
     "score_file",
+    "settings_digest",
     "settings_that_differ",
     "write_record",
 ]
 
 _FORMAT = "torchrl_caiac.scores"
-_VERSION = 1
+_VERSION = 2
+_STATES = ("new", "scoring", "scored")
 
 
 def score_file(folder: str | Path, key: NestedKey = ("caiac", "score")) -> Path:
@@ -61,8 +63,9 @@ def read_record(
         key (NestedKey): the score leaf.
 
     Returns:
-        dict, optional: ``"state"`` (``"new"`` until the leaf is initialized, then
-        ``"scored"``), ``"settings"`` and others; ``None`` where there is no record.
+        dict, optional: ``"state"`` (``"new"`` until the leaf is initialized,
+        ``"scoring"`` until all rows are scored, then ``"scored"``), ``"settings"`` and
+        others; ``None`` where there is no record.
 
     Raises:
         ValueError: the file is damaged, or is not a score file of this version.
@@ -90,7 +93,7 @@ def read_record(
             f"the score file {file} has version {record.get('version')!r}, this "
             f"package reads {_VERSION}: update torchrl_caiac, or {remedy}"
         )
-    if record.get("state") not in ("new", "scored") or not isinstance(
+    if record.get("state") not in _STATES or not isinstance(
         record.get("settings"), dict
     ):
         raise ValueError(f"the score file {file} is incomplete: {remedy}")
@@ -113,7 +116,7 @@ def write_record(
         key (NestedKey): the score leaf.
         settings (dict): what the scores depend on.
         layout (EntityLayout): the entities.
-        state (str): ``"new"`` or ``"scored"``.
+        state (str): ``"new"``, ``"scoring"`` or ``"scored"``.
     """
     record = {
         "format": _FORMAT,
@@ -152,6 +155,18 @@ def settings_that_differ(before: dict[str, Any], now: dict[str, Any]) -> str:
         for name in {**before, **now}
         if before.get(name) != now.get(name)
     )
+
+
+def settings_digest(settings: dict[str, Any]) -> int:
+    """Returns a digest of settings, 32 bits.
+
+    Args:
+        settings (dict): what the scores depend on.
+
+    Returns:
+        int: at least 0, below ``2**32``.
+    """
+    return int(_sha(json.dumps(settings, sort_keys=True))[:8], 16)
 
 
 def layout_digest(layout: EntityLayout) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import nn
 
+from torchrl_caiac._fingerprints import fingerprint, state_hash
 from torchrl_caiac._keys import as_key, missing_key
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
@@ -20,18 +21,32 @@ __all__ = ["Scorer"]
 _NAMED = 8  # rows that an error names
 _SAMPLE = 4096  # states that are passed to the estimator's prepare()
 
-# Scores of the states of a block's rows, of the states after them, and which rows are
-# the last of their trajectories.
-_Block = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+
+class _Block(NamedTuple):
+    """The raw scores of a block of positions.
+
+    Attributes:
+        state (torch.Tensor): the scores of the states, ``[n, *feature_shape]``, NaN
+            where they were not computed.
+        after (torch.Tensor): the same of the states after them.
+        last (torch.Tensor): bool ``[n]``, which rows are the last of a trajectory.
+        fingerprints (torch.Tensor): int64 ``[n]``, of what was scored.
+    """
+
+    state: torch.Tensor
+    after: torch.Tensor
+    last: torch.Tensor
+    fingerprints: torch.Tensor
 
 
 class Scorer:
     """Computes the scores of a storage, one chunk of rows at a time.
 
-    The estimator is called on blocks of ``batch_size`` rows that start at multiples of
-    ``batch_size``. So the raw score of a state does not depend on where an interrupted
-    call resumed. A chunk consists of the rows of one block; all blocks that its windows
-    reach are read.
+    Rows are counted by their positions in the index of trajectories, in which the rows
+    of a trajectory are consecutive. The estimator is called on blocks of ``batch_size``
+    positions that start at multiples of ``batch_size``. So the raw score of a state
+    does not depend on where an interrupted call resumed. A chunk consists of the rows
+    of one block; all blocks that its windows reach are read.
 
     Args:
         data (TensorDictBase): the rows of the storage, ``[capacity]``.
@@ -44,11 +59,14 @@ class Scorer:
         smoothing (int): see :func:`~torchrl_caiac.influence.score_buffer`.
         lookahead (int): the same.
         every (int): the same.
+        settings (int): the settings in the fingerprints, 32 bits.
+        is_prepared (bool): whether the estimator was prepared. Defaults to ``False``.
 
     Attributes:
         num_chunks (int): the number of chunks.
         feature_shape (tuple of int, optional): the shape of the scores of a row,
             ``None`` until it is known.
+        is_prepared (bool): whether the estimator was prepared.
     """
 
     def __init__(
@@ -62,6 +80,8 @@ class Scorer:
         smoothing: int,
         lookahead: int,
         every: int,
+        settings: int,
+        is_prepared: bool = False,
     ) -> None:
         state_keys = list(layout.in_keys)
         in_keys = getattr(estimator, "in_keys", None)
@@ -74,6 +94,12 @@ class Scorer:
         self._next_states = (
             _select(data.get(layout.next_key), in_keys) if self._final else None
         )
+        self._hashed = data.select(
+            *state_keys, *(layout.next(key) for key in state_keys), strict=False
+        )
+        self._keys = state_keys
+        self._next_keys = [layout.next(key) for key in state_keys]
+        self._settings = settings
         self._estimator = estimator
         self._layout = layout
         self._index = index
@@ -82,24 +108,27 @@ class Scorer:
         self._future = (smoothing - 1) // 2
         self._lookahead = lookahead
         self._every = every
-        self._is_full = index.length == data.shape[0]
         self._device = _device(estimator)
-        self._is_prepared = False
+        self.is_prepared = is_prepared
         self._blocks: dict[int, _Block] = {}
         self.num_chunks = -(-index.length // batch_size)
         self.feature_shape: tuple[int, ...] | None = None
 
     def span(self, c: int) -> slice:
-        """Returns the rows of chunk ``c``."""
+        """Returns the positions of chunk ``c``."""
         start = c * self._batch_size
         return slice(start, min(start + self._batch_size, self._index.length))
 
-    def is_stale(self, c: int, leaf: torch.Tensor) -> bool:
-        """Returns whether chunk ``c`` has, or its windows reach, an unscored row."""
-        # Trajectories do not matter here: if one was overwritten in part, the rest of
-        # it has lost neighbors too.
-        rows, _ = self._reach(c, ring=self._is_full)
-        return bool(leaf[rows.to(leaf.device)].isnan().any())
+    def rows(self, c: int) -> torch.Tensor:
+        """Returns the rows of chunk ``c``, int64 ``[n]``."""
+        span = self.span(c)
+        return self._index.rows(torch.arange(span.start, span.stop)).cpu()
+
+    @property
+    def reach(self) -> tuple[int, int]:
+        """The number of earlier and of later states that a score depends on."""
+        gap = self._every - 1
+        return self._past + gap, self._future + self._lookahead + gap
 
     def block(self, b: int) -> _Block:
         """Returns the raw scores of a block, computed once.
@@ -108,55 +137,105 @@ class Scorer:
             b (int): the number of the block.
 
         Returns:
-            tuple of torch.Tensor: the scores of the states of its ``n`` rows and of
-            the states after them, float32 ``[n, *feature_shape]``, NaN where they are
-            not needed; and which rows are the last of their trajectories, bool
-            ``[n]``.
+            _Block: its scores and fingerprints.
         """
         if b not in self._blocks:
             span = self.span(b)
-            rows = torch.arange(span.start, span.stop)
-            last = self._index.is_last(rows).cpu()
-            position = self._position(rows)
-            state = self._scores(
-                self._states, rows, position % self._every == 0, "state"
-            )
-            after = state
-            if self._next_states is not None and bool(last.any()):
-                needed = last & ((position + 1) % self._every == 0)
-                after = self._scores(self._next_states, rows, needed, "next state")
-            self._blocks[b] = state, after, last
+            self._blocks[b] = self._read(torch.arange(span.start, span.stop))
         return self._blocks[b]
 
-    def chunk(self, c: int) -> torch.Tensor:
-        """Returns the final scores of chunk ``c``, float32 ``[n, *feature_shape]``."""
-        rows, first = self._reach(c, ring=self._index.wraps)
-        blocks = rows // self._batch_size
-        needed = blocks.unique().tolist()
+    def chunk(self, c: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the final scores of chunk ``c``.
+
+        Args:
+            c (int): the number of the chunk.
+
+        Returns:
+            tuple of torch.Tensor: the scores, float32 ``[n, *feature_shape]``, and the
+            fingerprints, int64 ``[n]``, of its rows.
+        """
+        span = self.span(c)
+        start, stop = self._around(span.start, span.stop)
+        needed = range(start // self._batch_size, -(-stop // self._batch_size))
         # Keep no more blocks than one chunk reaches.
         self._blocks = {b: v for b, v in self._blocks.items() if b in needed}
         parts = [self.block(b) for b in needed]
-        shape = (len(rows), *parts[0][0].shape[1:])
-        state, after = torch.empty(shape), torch.empty(shape)
-        last = torch.empty(len(rows), dtype=torch.bool)
-        for b, (block_state, block_after, block_last) in zip(
-            needed, parts, strict=True
-        ):
-            here = blocks == b
-            offset = rows[here] - b * self._batch_size
-            state[here] = block_state[offset]
-            after[here] = block_after[offset]
-            last[here] = block_last[offset]
+        first = start - needed[0] * self._batch_size
+        whole = _Block(
+            *(
+                torch.cat(leaves)[first : first + stop - start]
+                for leaves in zip(*parts, strict=True)
+            )
+        )
+        inside = slice(span.start - start, span.stop - start)
+        return self._final_scores(whole)[inside], whole.fingerprints[inside]
+
+    def some(self, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the final scores of some rows, from no more states than they need.
+
+        Args:
+            position (torch.Tensor): int64 ``[n]``, ascending, within one chunk.
+
+        Returns:
+            tuple of torch.Tensor: as from :meth:`chunk`.
+        """
+        start, stop = self._around(int(position[0]), int(position[-1]) + 1)
+        before, after = self.reach
+        marks = torch.zeros(stop - start + 1, dtype=torch.long)
+        low = (position - before).clamp_min(start) - start
+        high = (position + after + 1).clamp_max(stop) - start
+        marks.index_add_(0, low, torch.ones_like(low))
+        marks.index_add_(0, high, -torch.ones_like(high))
+        is_needed = marks.cumsum(0)[:-1] > 0
+        part = self._read(torch.arange(start, stop), is_needed)
+        here = position - start
+        return self._final_scores(part)[here], part.fingerprints[here]
+
+    def _around(self, start: int, stop: int) -> tuple[int, int]:
+        before, after = self.reach
+        return max(0, start - before), min(stop + after, self._index.length)
+
+    def _read(
+        self, position: torch.Tensor, is_needed: torch.Tensor | None = None
+    ) -> _Block:
+        """Returns the raw scores at consecutive positions, NaN where not needed."""
+        rows = self._index.rows(position.to(self._index.device)).cpu()
+        last = self._index.is_last(rows).cpu()
+        # Before the scores: a state that is overwritten in between is found later.
+        fingerprints = self._fingerprints(rows)
+        number = self._number(position)
+        state = self._scores(
+            self._states, rows, _both(number % self._every == 0, is_needed), "state"
+        )
+        after = state
+        if self._next_states is not None and bool(last.any()):
+            is_scored = last & ((number + 1) % self._every == 0)
+            after = self._scores(
+                self._next_states, rows, _both(is_scored, is_needed), "next state"
+            )
+        return _Block(state, after, last, fingerprints)
+
+    def _fingerprints(self, rows: torch.Tensor) -> torch.Tensor:
+        part = _taken(self._hashed, rows)
+        state = state_hash(part, self._keys)
+        assert state is not None  # layout.check found the state
+        return fingerprint(
+            state, state_hash(part, self._next_keys), self._settings
+        ).cpu()
+
+    def _final_scores(self, block: _Block) -> torch.Tensor:
+        """Returns scores after smoothing and lookahead, ``[n, *feature_shape]``."""
+        state, after, last, _ = block
         # All states in the order of time: the state of each row, and after the last
         # row of a trajectory its next state.
         ended = last.cumsum(0) - last.long()
-        place = torch.arange(len(rows))
+        place = torch.arange(len(last))
         trajectory = ended
         raw = state
         if self._final:
             place = place + ended
-            size = len(rows) + int(last.sum())
-            raw = torch.empty((size, *shape[1:]))
+            size = len(last) + int(last.sum())
+            raw = torch.empty((size, *state.shape[1:]))
             raw[place] = state
             raw[place[last] + 1] = after[last]
             trajectory = torch.empty(size, dtype=torch.long)
@@ -165,26 +244,14 @@ class Scorer:
         if self._every > 1:
             raw = fill_between(raw, trajectory, ~raw.flatten(1).isnan().any(1))
         smoothed = smooth(raw, trajectory, self._past, self._future)
-        best = max_ahead(smoothed, trajectory, self._lookahead)
-        span = self.span(c)
-        return best[place[first : first + span.stop - span.start]]
+        return max_ahead(smoothed, trajectory, self._lookahead)[place]
 
-    def _reach(self, c: int, *, ring: bool) -> tuple[torch.Tensor, int]:
-        """Returns the rows that a chunk reads, and the number of rows before it."""
-        span, gap = self.span(c), self._every - 1
-        before = self._past + gap
-        start, stop = span.start - before, span.stop + self._future + self._lookahead
-        if ring:
-            return torch.arange(start, stop + gap) % self._index.length, before
-        stop = min(stop + gap, self._index.length)
-        return torch.arange(max(0, start), stop), min(before, span.start)
-
-    def _position(self, rows: torch.Tensor) -> torch.Tensor:
-        """Counts the rows of the same trajectory before each row, int64 ``[n]``."""
+    def _number(self, position: torch.Tensor) -> torch.Tensor:
+        """Counts the rows of the same trajectory before each one, int64 ``[n]``."""
         if self._every == 1:
-            return torch.zeros_like(rows)  # every state is scored
+            return torch.zeros_like(position)  # every state is scored
         index = self._index
-        position = index.position(rows.to(index.device))
+        position = position.to(index.device)
         number = torch.searchsorted(index.ends, position)
         start = index.ends[number] - index.lengths[number] + 1
         return (position - start).cpu()
@@ -198,14 +265,11 @@ class Scorer:
     ) -> torch.Tensor:
         """Returns the raw scores of some of a block's rows, NaN in the others."""
         if bool(needed.all()):
-            span = slice(int(rows[0]), int(rows[-1]) + 1)
-            return self._evaluate(states[span], rows, what)
+            return self._evaluate(_taken(states, rows), rows, what)
         chosen = rows[needed]
         found = None
         if len(chosen):
-            found = self._evaluate(
-                states[chosen.to(states.device or "cpu")], chosen, what
-            )
+            found = self._evaluate(_taken(states, chosen), chosen, what)
         assert self.feature_shape is not None  # the first row is always scored
         scores = torch.full((len(rows), *self.feature_shape), torch.nan)
         if found is not None:
@@ -215,7 +279,7 @@ class Scorer:
     def _prepare(self) -> None:
         """Prepares the estimator with a sample, the same after an interruption."""
         prepare = getattr(self._estimator, "prepare", None)
-        if prepare is not None and not self._is_prepared:
+        if prepare is not None and not self.is_prepared:
             length = self._index.length
             count = min(length, _SAMPLE)
             rows = torch.linspace(0, length - 1, count, dtype=torch.float64).long()
@@ -223,7 +287,7 @@ class Scorer:
             if self._device is not None:
                 sample = sample.to(self._device)
             prepare(sample, length, smoothing=self._past + self._future + 1)
-        self._is_prepared = True
+        self.is_prepared = True
 
     def _evaluate(
         self, states: TensorDictBase, rows: torch.Tensor, what: str
@@ -297,6 +361,18 @@ def _select(data: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
             )
         chosen.set(key, value)
     return chosen
+
+
+def _taken(states: TensorDictBase, rows: torch.Tensor) -> TensorDictBase:
+    """Returns rows of states; consecutive ones as a view, which reads them faster."""
+    first, last = int(rows[0]), int(rows[-1])
+    if last - first == len(rows) - 1 and bool((rows.diff() == 1).all()):
+        return states[first : last + 1]
+    return states[rows.to(states.device or "cpu")]
+
+
+def _both(first: torch.Tensor, second: torch.Tensor | None) -> torch.Tensor:
+    return first if second is None else first & second
 
 
 def _device(estimator: Any) -> torch.device | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
@@ -20,7 +22,7 @@ class CAIACTransform(CounterfactualTransform):
     """Swaps entities that the agent does not influence with those of other samples.
 
     Append it to a replay buffer whose rows have scores (see
-    :func:`~torchrl_caiac.influence.score_buffer`). It makes the last
+    :func:`~torchrl_caiac.influence.score_buffer`). It makes
     ``round(counterfactual_ratio * B)`` rows of every batch counterfactual: every entity
     whose score is at most ``threshold`` takes its state and next state from a donor row
     in which it is uninfluenced too (Algorithm 1). Entities draw their donors
@@ -44,10 +46,12 @@ class CAIACTransform(CounterfactualTransform):
     can be any of its eligible windows. An entity without a donor is neither swapped nor
     flagged as swapped, and increases :attr:`no_donor_count`.
 
-    The scores of rows that are written through this transform are replaced by NaN,
-    which means not scored. Such rows are never swapped and never used as donors, and
-    sampling them raises an error until :func:`~torchrl_caiac.influence.score_buffer` is
-    called again.
+    A score that :func:`~torchrl_caiac.influence.score_buffer` wrote is used only for
+    the state that it was computed from: it has a fingerprint of the state and the next
+    state, which is compared in every batch. Rows that were written later, by whatever
+    process, raise an error (see ``unscored``) until ``score_buffer`` is called again.
+    So append this transform before others that change the state. Scores that you wrote
+    yourself, without fingerprints, are used as they are.
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
@@ -57,14 +61,21 @@ class CAIACTransform(CounterfactualTransform):
             counterfactual, in [0, 1]. Defaults to 0.5.
 
     Keyword Args:
+        rows (str): which rows (or windows) become counterfactual. ``"random"``: drawn
+            in each batch; ``"last"``: the last ones, for a
+            :class:`~torchrl.data.HERReplayBuffer`, which relabels the first ones.
+            Defaults to ``"random"``.
         swap_prob (float): probability of swapping each uninfluenced entity. Defaults
             to 1.
         window (int): rows in a window, κ. Defaults to 1.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
             Defaults to the rows of the same batch. A buffer has to be scored, have the
-            same layout, and be one-dimensional. Pickling the transform pickles it.
+            same layout. Pickling the transform pickles it.
         score_key (NestedKey): the scores, ``[*, N]``. Defaults to
             ``("caiac", "score")``.
+        unscored (str): what happens to rows that have no score, or one of another
+            state. ``"raise"``: an error; ``"keep"``: they neither swap nor donate, and
+            :attr:`unscored_count` counts them. Defaults to ``"raise"``.
         reward_fn (callable, optional): ``(next_achieved [C, G], desired [C, G])`` to
             rewards ``[C]`` or ``[C, 1]``; recomputes the rewards of counterfactual
             rows. Defaults to ``None``: the stored rewards are kept.
@@ -95,8 +106,7 @@ class CAIACTransform(CounterfactualTransform):
         >>> _ = rb.extend(TensorDict({
         ...     "observation": state, ("next", "observation"): state + 0.5,
         ...     ("caiac", "score"): torch.zeros(100, 2)}, [100]))
-        >>> rb.append_transform(CAIACTransform(layout))  # doctest: +ELLIPSIS
-        ReplayBuffer(...)
+        >>> _ = rb.append_transform(CAIACTransform(layout, rows="last"))
         >>> batch = rb.sample()
         >>> batch["caiac", "counterfactual"].flatten()
         tensor([False, False,  True,  True])
@@ -115,10 +125,12 @@ class CAIACTransform(CounterfactualTransform):
         threshold: float = 0.05,
         counterfactual_ratio: float = 0.5,
         *,
+        rows: Literal["random", "last"] = "random",
         swap_prob: float = 1.0,
         window: int = 1,
         donors: ReplayBuffer | TensorStorage | None = None,
         score_key: NestedKey = ("caiac", "score"),
+        unscored: Literal["raise", "keep"] = "raise",
         reward_fn: RewardFn | None = None,
         goals: WindowGoal | None = None,
         generator: torch.Generator | None = None,
@@ -129,10 +141,12 @@ class CAIACTransform(CounterfactualTransform):
             layout,
             threshold,
             counterfactual_ratio,
+            rows=rows,
             swap_prob=swap_prob,
             window=window,
             donors=donors,
             score_key=score_key,
+            unscored=unscored,
             reward_fn=reward_fn,
             goals=goals,
             generator=generator,

@@ -1,4 +1,4 @@
-"""Checks of arguments, and of the values of each batch."""
+"""Checks of arguments, and values that are checked without waiting for them."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = [
-    "BatchCheck",
     "LateCheck",
+    "check_choice",
     "check_generator",
     "check_layout",
     "check_number",
@@ -55,6 +52,33 @@ def check_number(name: str, value: Any, high: float) -> float:
         limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"
         raise ValueError(f"{name} must be {limits}, got {value!r}")
     return float(value)
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> Any:
+    """Returns one of several strings, or raises.
+
+    Args:
+        name (str): the argument.
+        value (Any): its value.
+        choices (sequence of str): what it may be.
+
+    Returns:
+        str: the value.
+
+    Raises:
+        ValueError: it is something else.
+
+    Examples:
+        >>> from torchrl_caiac.transforms.checks import check_choice
+        >>> check_choice("rows", "first", ("random", "last"))
+        Traceback (most recent call last):
+        ...
+        ValueError: rows must be 'random' or 'last', got 'first'
+    """
+    if value not in choices:
+        names = " or ".join(map(repr, choices))
+        raise ValueError(f"{name} must be {names}, got {value!r}")
+    return value
 
 
 def check_layout(layout: Any) -> EntityLayout:
@@ -165,140 +189,3 @@ class LateCheck:
 
     def __reduce__(self) -> tuple[type[LateCheck], tuple[()]]:
         return LateCheck, ()  # a copy starts empty
-
-
-class BatchCheck:
-    """Raises if the values of a batch are invalid.
-
-    Scores and observations must be finite, and windows must stay within trajectories.
-    On a CUDA device nothing waits for the result: an error is raised at a later batch.
-
-    Args:
-        layout (EntityLayout): the entities.
-
-    Keyword Args:
-        score_key (NestedKey): the scores.
-        window (int): rows in a window.
-        keys (TransformKeys): trajectory ids and end flags.
-        scores_name (str): the name of the scores in error messages.
-    """
-
-    def __init__(
-        self,
-        layout: EntityLayout,
-        *,
-        score_key: NestedKey,
-        window: int,
-        keys: TransformKeys,
-        scores_name: str,
-    ) -> None:
-        self.layout = layout
-        self.score_key = score_key
-        self.window = window
-        self.keys = keys
-        self.scores_name = scores_name
-        self._late = LateCheck()
-
-    def __call__(
-        self,
-        before: TensorDictBase,
-        after: TensorDictBase,
-        scores: torch.Tensor,
-        states: Sequence[NestedKey],
-    ) -> None:
-        """Checks a batch.
-
-        Args:
-            before (TensorDictBase): the batch as it was sampled, ``[B * window]``.
-            after (TensorDictBase): the batch after swapping.
-            scores (torch.Tensor): its scores, ``[B * window, ...]``.
-            states (sequence of NestedKey): the floating-point leaves of its states.
-
-        Raises:
-            ValueError: a value is not finite, or a window crosses a trajectory's end.
-        """
-        observed = [after.get(key) for key in states]
-        crossings = self._crossings(before)
-        leaves = [scores, *observed]
-        # A sum is finite if all its terms are (unless it overflows: see _explain).
-        if not LateCheck.needed(scores.device):
-            finite = math.isfinite(sum(leaf.sum().item() for leaf in leaves))
-            if not finite or (crossings is not None and bool(crossings.any())):
-                self._explain(after, scores, states, crossings)
-            return
-        found = self._late.found()
-        if found:
-            # The newest batch is likely to have the same fault.
-            self._explain(after, scores, states, crossings)
-            names = [self.score_key, *states, "the windows"]
-            raise ValueError(
-                f"{[names[place] for place in found]} were invalid in an earlier "
-                f"batch: {self.scores_name} or observations are NaN or infinite, or "
-                "windows cross a trajectory's end. On a CUDA device errors are late; "
-                "sample the same data on the CPU to find the rows"
-            )
-        sums = [leaf.sum(dtype=torch.float64) for leaf in leaves]
-        if crossings is not None:
-            sums.append(torch.where(crossings.any(), math.nan, 0.0).double())
-        self._late.add(torch.stack(sums))
-
-    def _crossings(self, td: TensorDictBase) -> torch.Tensor | None:
-        """Returns where a window leaves its trajectory, bool ``[B, window - 1]``."""
-        if self.window == 1:
-            return None
-        found = None
-        if self.keys.trajectory is not None:
-            ids = td.get(self.keys.trajectory, None)
-            if ids is not None:
-                ids = ids.reshape(-1, self.window)
-                found = ids[:, 1:] != ids[:, :-1]
-        if self.keys.done is not None:
-            done = td.get(self.keys.done, None)
-            if done is not None:
-                ended = done.reshape(-1, self.window)[:, :-1].bool()
-                found = ended if found is None else found | ended
-        return found
-
-    def _explain(
-        self,
-        after: TensorDictBase,
-        scores: torch.Tensor,
-        states: Sequence[NestedKey],
-        crossings: torch.Tensor | None,
-    ) -> None:
-        nan, infinite = scores.isnan(), scores.isinf()
-        if nan.any():
-            rows = int(nan.flatten(1).any(1).sum())
-            raise ValueError(
-                f"{self.score_key!r} is NaN, that is not scored, in {rows} of "
-                f"{scores.shape[0]} rows for {self._entities(nan)}: call score_buffer "
-                "on the replay buffer after extending it"
-            )
-        if infinite.any():
-            raise ValueError(
-                f"{self.score_key!r} is infinite for {self._entities(infinite)}: check "
-                "the influence measure, then call score_buffer(..., overwrite=True)"
-            )
-        if crossings is not None and crossings.any():
-            window = int(crossings.any(1).nonzero()[0, 0])
-            raise ValueError(
-                f"window {window} of {self.window} rows crosses a trajectory's end "
-                f"according to {self.keys.trajectory!r} or {self.keys.done!r}: use "
-                f"SliceSampler with slice_len={self.window}, strict_length=True and "
-                "trajectories of at least this length. If end flags do not end a "
-                "trajectory in these data, pass keys=TransformKeys(done=None)"
-            )
-        for key in states:
-            bad = ~after.get(key).isfinite()
-            if bad.any():
-                row = int(bad.flatten(1).any(1).nonzero()[0, 0])
-                raise ValueError(
-                    f"{key!r} is not finite (NaN or infinite) in {int(bad.sum())} "
-                    f"values, first in row {row} of the batch: clean the data, or "
-                    "the donors' data"
-                )
-
-    def _entities(self, bad: torch.Tensor) -> list[str]:
-        """Returns the entities that have a bad score, ``[*, N]``."""
-        columns = bad.reshape(-1, bad.shape[-1]).any(0).nonzero()[:, 0]
-        return [self.layout.names[column] for column in columns.tolist()]

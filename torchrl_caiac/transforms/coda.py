@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
@@ -27,7 +29,7 @@ class CoDATransform(CounterfactualTransform):
     The baseline of Pitis et al. (2020) that the paper compares with. Each row has a
     graph of local influence, from the entities and the action to the entities (see
     :class:`~torchrl_caiac.influence.AttentionInfluence`). Scores above ``threshold``
-    are links, in either direction, and links form connected components. In the last
+    are links, in either direction, and links form connected components. In
     ``round(counterfactual_ratio * B)`` rows of a batch, every component that does not
     contain the action takes its states and next states from a donor row in which the
     same set of entities is a component without the action too. Components draw their
@@ -47,6 +49,10 @@ class CoDATransform(CounterfactualTransform):
             counterfactual, in [0, 1]. Defaults to 0.5.
 
     Keyword Args:
+        rows (str): which rows (or windows) become counterfactual. ``"random"``: drawn
+            in each batch; ``"last"``: the last ones, for a
+            :class:`~torchrl.data.HERReplayBuffer`, which relabels the first ones.
+            Defaults to ``"random"``.
         swap_prob (float): probability of swapping each component. Defaults to 1.
         window (int): rows in a window, κ. Defaults to 1.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
@@ -54,6 +60,9 @@ class CoDATransform(CounterfactualTransform):
         graph_key (NestedKey): the graphs, ``[*, N + 1, N]``: from the row (the
             entities in layout order, then the action) to the column. Defaults to
             ``("coda", "graph")``.
+        unscored (str): what happens to rows that have no score, or one of another
+            state. ``"raise"``: an error; ``"keep"``: they neither swap nor donate, and
+            :attr:`unscored_count` counts them. Defaults to ``"raise"``.
         reward_fn (callable, optional): ``(next_achieved [C, G], desired [C, G])`` to
             rewards ``[C]`` or ``[C, 1]``; recomputes the rewards of counterfactual
             rows. Defaults to ``None``: the stored rewards are kept.
@@ -85,8 +94,7 @@ class CoDATransform(CounterfactualTransform):
         >>> _ = rb.extend(TensorDict({
         ...     "observation": state, ("next", "observation"): state + 0.5,
         ...     ("coda", "graph"): graph.expand(100, 5, 4)}, [100]))
-        >>> rb.append_transform(CoDATransform(layout))  # doctest: +ELLIPSIS
-        ReplayBuffer(...)
+        >>> _ = rb.append_transform(CoDATransform(layout, rows="last"))
         >>> batch = rb.sample()
         >>> batch["caiac", "swapped"]
         tensor([[False, False, False, False],
@@ -106,10 +114,12 @@ class CoDATransform(CounterfactualTransform):
         threshold: float = 0.2,
         counterfactual_ratio: float = 0.5,
         *,
+        rows: Literal["random", "last"] = "random",
         swap_prob: float = 1.0,
         window: int = 1,
         donors: ReplayBuffer | TensorStorage | None = None,
         graph_key: NestedKey = ("coda", "graph"),
+        unscored: Literal["raise", "keep"] = "raise",
         reward_fn: RewardFn | None = None,
         goals: WindowGoal | None = None,
         generator: torch.Generator | None = None,
@@ -120,10 +130,12 @@ class CoDATransform(CounterfactualTransform):
             layout,
             threshold,
             counterfactual_ratio,
+            rows=rows,
             swap_prob=swap_prob,
             window=window,
             donors=donors,
             score_key=graph_key,
+            unscored=unscored,
             reward_fn=reward_fn,
             goals=goals,
             generator=generator,

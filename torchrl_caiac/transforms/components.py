@@ -169,11 +169,12 @@ def draw_batch_components(
     *,
     window: int = 1,
     swap_prob: float = 1.0,
+    windows: torch.Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> SwapDraw:
     """Draws donors among the windows of the batch itself.
 
-    Each component of each of the last windows draws one of the *other* windows that
+    Each component of each counterfactual window draws one of the *other* windows that
     have the same component, all with the same probability and independently of the
     other components.
 
@@ -185,6 +186,8 @@ def draw_batch_components(
     Keyword Args:
         window (int): rows in a window. Defaults to 1.
         swap_prob (float): probability of swapping a component. Defaults to 1.
+        windows (torch.Tensor, optional): int64 ``[C]``, the windows that become
+            counterfactual. Defaults to the last ones.
         generator (torch.Generator, optional): source of randomness.
 
     Returns:
@@ -199,9 +202,9 @@ def draw_batch_components(
         >>> draw.donors, draw.swapped
         (tensor([[0, 0, 1]]), tensor([[True, True, True]]))
     """
-    windows, entities = masks.shape
-    first = windows - num_counterfactual
-    tail = masks[first:]
+    count, entities = masks.shape
+    first = count - num_counterfactual
+    tail = masks[first:] if windows is None else masks.index_select(0, windows)
     leader, pick, is_chosen = _shared(tail, swap_prob, generator)
     # Sorted, the windows of each component are consecutive, each once, by its leader.
     keys, order = torch.where(_leads(masks), masks, 0).flatten().sort(stable=True)
@@ -211,10 +214,13 @@ def draw_batch_components(
     others = torch.searchsorted(keys, tail, right=True) - begin - 1
     chosen = begin + pick % others.clamp_min(1)
     # A window is among those of its own component: skip it.
-    chosen += chosen >= place.view(windows, entities)[first:].gather(1, leader)
+    own = place.view(count, entities)
+    own = own[first:] if windows is None else own.index_select(0, windows)
+    chosen += chosen >= own.gather(1, leader)
     donors = pick_rows(order, chosen.clamp_max(order.shape[0] - 1)) // entities
     swapped = is_chosen & (others > 0)
-    return SwapDraw(donors * window, swapped, (is_chosen ^ swapped).sum(0))
+    no_donor = (is_chosen ^ swapped).sum(0)
+    return SwapDraw(donors * window, swapped, no_donor, windows=windows)
 
 
 def draw_buffer_components(

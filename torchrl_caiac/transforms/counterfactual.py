@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data import HERReplayBuffer, ReplayBuffer, TensorStorage
 
 from torchrl_caiac._buffer_transform import BufferTransform
+from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._keys import as_key
+from torchrl_caiac._torchrl import sampling_buffer
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence.mark_unscored import set_unscored
+from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import (
-    BatchCheck,
+    check_choice,
     check_generator,
     check_layout,
     check_number,
@@ -25,8 +27,9 @@ from torchrl_caiac.transforms.checks import (
     check_window,
 )
 from torchrl_caiac.transforms.donors import BufferDonors
-from torchrl_caiac.transforms.draws import SwapDraw
+from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
 from torchrl_caiac.transforms.goals.window import WindowGoal
+from torchrl_caiac.transforms.indexing import window_rows
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import RewardFn, recompute_reward
 from torchrl_caiac.transforms.swap import SwapPlan, SwapPlanner, apply_swap
@@ -37,11 +40,11 @@ _Transform = TypeVar("_Transform", bound="CounterfactualTransform")
 
 
 class CounterfactualTransform(BufferTransform, ABC):
-    """Makes the last rows of a batch counterfactual, by their scores.
+    """Makes rows of a batch counterfactual, by their scores.
 
     A subclass defines what may be swapped (:meth:`swappable`) and how donors are drawn
     (:attr:`draw_in_batch`; :attr:`donors_class` for a donor buffer). The steps of a
-    sample are: scores, draw, swap, rewards, check. See
+    sample are: scores, check, draw, swap, rewards. See
     :class:`~torchrl_caiac.transforms.CAIACTransform` for the leaves that are added.
 
     Args:
@@ -51,10 +54,14 @@ class CounterfactualTransform(BufferTransform, ABC):
             counterfactual.
 
     Keyword Args:
+        rows (str): which rows (or windows) become counterfactual: ``"random"`` or
+            ``"last"``.
         swap_prob (float): probability of swapping what may be swapped.
         window (int): rows in a window, κ.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
         score_key (NestedKey): the scores.
+        unscored (str): what happens to rows without valid scores: ``"raise"`` or
+            ``"keep"``.
         reward_fn (callable, optional): recomputes rewards of counterfactual rows.
         goals (WindowGoal, optional): draws the goals of donor windows.
         generator (torch.Generator, optional): source of randomness.
@@ -73,10 +80,12 @@ class CounterfactualTransform(BufferTransform, ABC):
         threshold: float,
         counterfactual_ratio: float,
         *,
+        rows: Literal["random", "last"],
         swap_prob: float,
         window: int,
         donors: ReplayBuffer | TensorStorage | None,
         score_key: NestedKey,
+        unscored: Literal["raise", "keep"],
         reward_fn: RewardFn | None,
         goals: WindowGoal | None,
         generator: torch.Generator | None,
@@ -88,6 +97,12 @@ class CounterfactualTransform(BufferTransform, ABC):
         self.threshold = check_number("threshold", threshold, math.inf)
         self.counterfactual_ratio = check_number(
             "counterfactual_ratio", counterfactual_ratio, 1.0
+        )
+        self.chosen_rows: Literal["random", "last"] = check_choice(
+            "rows", rows, ("random", "last")
+        )
+        self.unscored: Literal["raise", "keep"] = check_choice(
+            "unscored", unscored, ("raise", "keep")
         )
         self.swap_prob = check_number("swap_prob", swap_prob, 1.0)
         self.window = check_window(window)
@@ -119,11 +134,19 @@ class CounterfactualTransform(BufferTransform, ABC):
             window=window,
             keys=self.keys,
             scores_name=self.donors_class.scores_name,
+            unscored=self.unscored,
         )
         self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
+        self._unscored = torch.zeros((), dtype=torch.int64)
+        self._knows_buffer = self.chosen_rows == "last"
         swapped = self._planner.keys
         rewards = [] if reward_fn is None else [self.keys.reward]
-        self.in_keys = [*swapped, self.score_key, *rewards]
+        self.in_keys = [
+            *swapped,
+            self.score_key,
+            fingerprint_key(self.score_key),
+            *rewards,
+        ]
         self.out_keys = [
             *swapped,
             *rewards,
@@ -185,6 +208,11 @@ class CounterfactualTransform(BufferTransform, ABC):
         """Sets :attr:`no_donor_count` to zero."""
         self._no_donor.zero_()
 
+    @property
+    def unscored_count(self) -> int:
+        """The number of sampled rows without valid scores, with ``unscored="keep"``."""
+        return int(self._unscored)
+
     def set_generator(self, generator: torch.Generator | None) -> None:
         """Sets the source of randomness.
 
@@ -203,14 +231,25 @@ class CounterfactualTransform(BufferTransform, ABC):
             donors.refresh()
 
     def share_memory_(self: _Transform) -> _Transform:
-        """Moves the counter to shared memory, for buffers used by several processes."""
+        """Moves the counters to shared memory, for buffers of several processes."""
         self._no_donor.share_memory_()
+        self._unscored.share_memory_()
         return self
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Returns the state of the generator, for ``state_dict``."""
+        generator = self.generator
+        return {} if generator is None else {"generator": generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`get_extra_state` returned."""
+        if self.generator is not None and "generator" in state:
+            self.generator.set_state(state["generator"].cpu())
 
     # --- the two halves of an augmentation -------------------------------------------
 
     def num_counterfactual(self, windows: int) -> int:
-        """Returns how many of the last windows of a batch become counterfactual.
+        """Returns how many windows of a batch become counterfactual.
 
         Args:
             windows (int): windows in the batch, ``B``.
@@ -231,22 +270,29 @@ class CounterfactualTransform(BufferTransform, ABC):
                 the transform's own.
 
         Returns:
-            SwapDraw: the draw, for the last ``C`` windows.
+            SwapDraw: the draw, for ``C`` windows.
         """
         generator = self.generator if generator is None else generator
         free = self.swappable(scores)
-        count = self.num_counterfactual(free.shape[0])
-        if self._donors:
-            return self._donors[0].draw(
-                free[free.shape[0] - count :],
-                swap_prob=self.swap_prob,
-                generator=generator,
+        total = free.shape[0]
+        count = self.num_counterfactual(total)
+        windows = None
+        if self.chosen_rows == "random" and 0 < count < total:
+            windows = draw_windows(
+                total, count, device=free.device, generator=generator
             )
+        if self._donors:
+            chosen = free[total - count :] if windows is None else free[windows]
+            draw = self._donors[0].draw(
+                chosen, swap_prob=self.swap_prob, generator=generator
+            )
+            return draw._replace(windows=windows)
         return self.draw_in_batch(
             free,
             count,
             window=self.window,
             swap_prob=self.swap_prob,
+            windows=windows,
             generator=generator,
         )
 
@@ -277,61 +323,93 @@ class CounterfactualTransform(BufferTransform, ABC):
             out = apply_swap(td, plan, values, draw, window=self.window)
         keys, swapped = self.keys, draw.swapped
         total, changed = td.shape[0], swapped.shape[0] * self.window
+        rows = window_rows(draw.windows, self.window)
+        if rows is None:
+            rows = torch.arange(total - changed, total, device=swapped.device)
         if self.reward_fn is not None and changed:
             reward = recompute_reward(
-                out, self.layout, self.reward_fn, changed, reward_key=keys.reward
+                out, self.layout, self.reward_fn, rows, reward_key=keys.reward
             )
             out.set(keys.reward, reward)
         if self.window > 1:
             swapped = swapped.unsqueeze(1).expand(-1, self.window, -1).flatten(0, 1)
-        kept = swapped.new_zeros(total - changed, swapped.shape[-1])
         counterfactual = swapped.new_zeros(total, 1)
-        counterfactual[total - changed :].fill_(True)
-        out.set(keys.counterfactual, counterfactual)
-        out.set(keys.swapped, torch.cat([kept, swapped]))
+        out.set(keys.counterfactual, counterfactual.index_fill_(0, rows, True))
+        flags = swapped.new_zeros(total, swapped.shape[-1])
+        out.set(keys.swapped, flags.index_copy_(0, rows, swapped))
         return out
 
     # --- the transform ---------------------------------------------------------------
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Makes the last rows of a batch counterfactual.
+        """Makes rows of a batch counterfactual.
 
         Args:
-            tensordict (TensorDictBase): the batch ``[B * window]``, with scores.
+            tensordict (TensorDictBase): the batch ``[B * window]``, with scores. With
+                several batch dimensions, such as those of
+                :class:`~torchrl.data.ReplayBufferEnsemble`, windows lie along the last
+                one.
 
         Returns:
             TensorDictBase: a shallow copy with new leaves; the input is not changed.
 
         Raises:
             KeyError: scores, or a leaf that the layout names, are missing.
-            RuntimeError: the batch was relabelled before.
-            ValueError: the batch does not fit the layout or the window, or a value is
-                not finite.
+            RuntimeError: the batch was relabelled before, or a
+                :class:`~torchrl.data.HERReplayBuffer` will relabel rows of it.
+            ValueError: the batch does not fit the layout or the window, a value is not
+                finite, a window is not one of successive rows, or a score belongs to
+                another state.
         """
+        if not self._knows_buffer:
+            self._check_buffer()
+        shape = tensordict.batch_size
+        if len(shape) != 1:
+            self._check_shape(tensordict)
+            tensordict = tensordict.reshape(-1)
         scores = self._scores(tensordict)
         plan, values = self._planner(tensordict)
+        checked: CheckedScores | None = None
+        if self.check:
+            checked = self._batch_check.before(tensordict, scores)
+            scores = checked.scores
         draw = self.generate_parameters(scores)
         out = self._swap(tensordict, plan, values, draw)
-        if self.check:
-            self._batch_check(tensordict, out, scores, plan.states)
+        if checked is not None:
+            self._batch_check.after(out, checked, plan.states)
+            if checked.unscored is not None:
+                if self._unscored.device != scores.device:
+                    self._unscored = self._unscored.to(scores.device)
+                self._unscored += checked.unscored
         if self._no_donor.device != draw.no_donor.device:
             self._no_donor = self._no_donor.to(draw.no_donor.device)
         self._no_donor += draw.no_donor
-        return out
+        return out if len(shape) == 1 else out.reshape(shape)
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # Scores of another origin, which come with the rows, may have another dtype.
-        scores = tensordict.get(self.score_key, None)
-        known = scores is not None and scores.is_floating_point()
-        dtype = scores.dtype if known else torch.float32
-        return set_unscored(tensordict, self.score_key, self.feature_shape, dtype=dtype)
+    def _check_buffer(self) -> None:
+        """Raises if the buffer relabels the first rows of a batch later."""
+        self._knows_buffer = True
+        buffer = sampling_buffer()
+        if isinstance(buffer, HERReplayBuffer) and buffer.her_ratio > 0:
+            raise RuntimeError(
+                "HERReplayBuffer relabels the first rows of each batch after all "
+                "transforms, so these must not be counterfactual: pass rows='last' to "
+                f"{type(self).__name__}, and a her_ratio of at most "
+                "1 - counterfactual_ratio"
+            )
+
+    def _check_shape(self, td: TensorDictBase) -> None:
+        if not td.batch_size or td.batch_size[-1] % self.window:
+            raise ValueError(
+                f"the batch has shape {list(td.shape)}, whose last dimension is not a "
+                f"multiple of the window {self.window}: sample whole windows from each "
+                "buffer"
+            )
 
     def _scores(self, td: TensorDictBase) -> torch.Tensor:
-        if td.ndim != 1 or not td.shape[0]:
+        if not td.shape[0]:
             raise ValueError(
-                f"the batch has shape {list(td.shape)}, expected [B * window] with at "
-                "least one row: sample flat batches from a buffer that is not empty "
-                "(use rb.storage[...] to read rows as they are stored)"
+                "the batch has no rows: sample from a buffer that is not empty"
             )
         if td.shape[0] % self.window:
             raise ValueError(
@@ -368,7 +446,8 @@ class CounterfactualTransform(BufferTransform, ABC):
         return (
             f"threshold={self.threshold}, "
             f"counterfactual_ratio={self.counterfactual_ratio}, "
-            f"swap_prob={self.swap_prob}, window={self.window}, donors={donors}"
+            f"rows={self.chosen_rows!r}, swap_prob={self.swap_prob}, "
+            f"window={self.window}, donors={donors}"
         )
 
     def __repr__(self) -> str:

@@ -10,7 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
-from torchrl_caiac._torchrl import storage_data, storage_revision
+from torchrl_caiac._fingerprints import fingerprint_key, rows_with_fingerprints
+from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 from torchrl_caiac.transforms.draws import DonorIndex, SwapDraw, draw_buffer_donors
@@ -54,10 +55,11 @@ def scan_donors(
     if window > 1 and trajectories is None:
         raise ValueError("windows of several rows need the trajectories of the storage")
     length = values.shape[0]
-    oldest = 0 if trajectories is None else trajectories.oldest
     for begin in range(0, length - window + 1, step):
         end = min(begin + step + window - 1, length)
-        rows = (torch.arange(begin, end, device=values.device) + oldest) % length
+        rows = torch.arange(begin, end, device=values.device)
+        if trajectories is not None:
+            rows = trajectories.rows(rows)
         part = values[rows]
         infinite = torch.isinf(part)
         if infinite.any():
@@ -178,7 +180,9 @@ class BufferDonors:
         self.score_key = score_key
         self.keys = keys
         self.goals = goals
-        self._built: tuple[Any, Any, TrajectoryIndex | None] | None = None
+        self._built: tuple[Any, Any, TrajectoryIndex | None, TensorDictBase] | None = (
+            None
+        )
         # The donors' leaves for the last plan, and the tensordict that they come from.
         self._read: tuple[SwapPlan, TensorDictBase, list[torch.Tensor]] | None = None
 
@@ -210,8 +214,8 @@ class BufferDonors:
         """Draws among the windows of :meth:`eligible`."""
         return draw_buffer_donors(free, index, **kwargs)
 
-    def index(self) -> tuple[Any, TrajectoryIndex | None]:
-        """Returns the eligible windows, and the trajectories where they are needed.
+    def index(self) -> tuple[Any, TrajectoryIndex | None, TensorDictBase]:
+        """Returns the eligible windows, the trajectories if needed, and the rows.
 
         Raises:
             KeyError: the donors have no scores.
@@ -221,11 +225,11 @@ class BufferDonors:
         if self._built is None or self._built[0] != revision:
             self._built = (revision, *self._build())
             self._read = None
-        return self._built[1], self._built[2]
+        return self._built[1:]
 
-    def _build(self) -> tuple[Any, TrajectoryIndex | None]:
+    def _build(self) -> tuple[Any, TrajectoryIndex | None, TensorDictBase]:
         storage = self.storage
-        data = self._data()
+        data = storage_rows(storage, "the donor buffer")
         scores = data.get(self.score_key, None)
         if scores is None:
             raise KeyError(
@@ -242,20 +246,29 @@ class BufferDonors:
         trajectories = None
         if self.window > 1 or self.goals is not None:
             trajectories = trajectory_index(
-                storage, trajectory_key=self.keys.trajectory, done_key=self.keys.done
+                self.donors,
+                trajectory_key=self.keys.trajectory,
+                done_key=self.keys.done,
             )
-        eligible = self.eligible(plain_tensor(scores)[: len(storage)], trajectories)
-        return eligible, trajectories
+        eligible = self.eligible(self._valid(data, scores), trajectories)
+        return eligible, trajectories, data
 
-    def _data(self) -> TensorDictBase:
-        """Returns the storage's tensordict, which may be longer than its content."""
-        data = storage_data(self.storage, "the donor buffer")
-        if self.storage.ndim != 1:
-            raise ValueError(
-                f"the donor buffer has a storage with ndim={self.storage.ndim}, "
-                "expected a one-dimensional one"
-            )
-        return data
+    def _valid(self, data: TensorDictBase, scores: torch.Tensor) -> torch.Tensor:
+        """Returns the scores ``[T, ...]``, NaN where they are those of other states."""
+        layout, length = self.layout, len(self.storage)
+        scores = plain_tensor(scores)[:length]
+        known = data.get(fingerprint_key(self.score_key), None)
+        if known is None:
+            return scores
+        next_keys = [layout.next(key) for key in layout.in_keys]
+        is_valid = rows_with_fingerprints(
+            data, plain_tensor(known)[:length], layout.in_keys, next_keys
+        )
+        if bool(is_valid.all()):
+            return scores
+        return torch.where(
+            is_valid.view(-1, *(1,) * (scores.ndim - 1)), scores, torch.nan
+        )
 
     def draw(
         self,
@@ -276,7 +289,7 @@ class BufferDonors:
         Returns:
             SwapDraw: donors and goals as rows of the donor storage.
         """
-        index, trajectories = self.index()
+        index, trajectories, _ = self.index()
         draw = self.choose(free, index, swap_prob=swap_prob, generator=generator)
         if self.goals is None or trajectories is None:
             return draw
@@ -292,8 +305,7 @@ class BufferDonors:
         draw: SwapDraw,
     ) -> TensorDictBase:
         """Applies what :meth:`draw` returned, see :func:`apply_swap`."""
-        _, trajectories = self.index()
-        data = self._data()
+        _, trajectories, data = self.index()
         if not len(draw.swapped):
             return td.copy()
         read = self._read
@@ -305,7 +317,7 @@ class BufferDonors:
             assert goals is not None and draw.goal_rows is not None
             return goals.donor_goals(data, draw.goal_rows, leaf.owner, leaf.key)
 
-        wraps = trajectories is not None and trajectories.oldest > 0
+        is_in_order = trajectories is None or trajectories.is_storage_order
         return apply_swap(
             td,
             plan,
@@ -313,7 +325,7 @@ class BufferDonors:
             draw,
             window=self.window,
             sources=read[2],
-            num_source_rows=len(self.storage) if wraps else None,
+            trajectories=None if is_in_order else trajectories,
             goals=None if goals is None else donor_goals,
         )
 

@@ -1,8 +1,8 @@
 """Random draws: which entities are swapped, and which donors they get.
 
 Every function is pure. A *window* is ``window`` consecutive rows of a flat batch, ``B``
-is the number of windows, ``C`` the number of counterfactual windows (the last ones of
-the batch), ``N`` the number of entities.
+is the number of windows, ``C`` the number of counterfactual windows, ``N`` the number
+of entities.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ __all__ = [
     "SwapDraw",
     "draw_batch_donors",
     "draw_buffer_donors",
+    "draw_windows",
     "uninfluenced",
 ]
 
@@ -35,12 +36,15 @@ class SwapDraw(NamedTuple):
             entity was to be swapped but had no donor.
         goal_rows (torch.Tensor, optional): int64 ``[C, N]``, the row of the donor
             storage whose next state is the goal of the donor window.
+        windows (torch.Tensor, optional): int64 ``[C]``, ascending, the counterfactual
+            windows of the batch; the last ones by default.
     """
 
     donors: torch.Tensor
     swapped: torch.Tensor
     no_donor: torch.Tensor
     goal_rows: torch.Tensor | None = None
+    windows: torch.Tensor | None = None
 
 
 class DonorIndex(NamedTuple):
@@ -82,6 +86,36 @@ def uninfluenced(
     return window_max(scores, window) <= threshold
 
 
+def draw_windows(
+    windows: int,
+    count: int,
+    *,
+    device: torch.device,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Draws windows of a batch without replacement.
+
+    Args:
+        windows (int): the number of windows in the batch, ``B``.
+        count (int): the number of windows to draw, ``C``.
+
+    Keyword Args:
+        device (torch.device): the device of the result.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        torch.Tensor: int64 ``[C]``, ascending.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.draws import draw_windows
+        >>> draw_windows(3, 3, device=torch.device("cpu"))
+        tensor([0, 1, 2])
+    """
+    order = draw_numbers(torch.randperm, windows, device=device, generator=generator)
+    return order[:count].sort().values
+
+
 def _drawn(
     free: torch.Tensor, swap_prob: float, generator: torch.Generator | None
 ) -> torch.Tensor:
@@ -99,11 +133,12 @@ def draw_batch_donors(
     *,
     window: int = 1,
     swap_prob: float = 1.0,
+    windows: torch.Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> SwapDraw:
     """Draws donors among the windows of the batch itself.
 
-    Each entity of each of the last windows draws one of the *other* windows in which
+    Each entity of each counterfactual window draws one of the *other* windows in which
     it is free too, all with the same probability and independently of the other
     entities.
 
@@ -115,6 +150,8 @@ def draw_batch_donors(
     Keyword Args:
         window (int): rows in a window. Defaults to 1.
         swap_prob (float): probability of swapping a free entity. Defaults to 1.
+        windows (torch.Tensor, optional): int64 ``[C]``, the windows that become
+            counterfactual. Defaults to the last ones.
         generator (torch.Generator, optional): source of randomness.
 
     Returns:
@@ -128,13 +165,15 @@ def draw_batch_donors(
         >>> draw.donors, draw.swapped
         (tensor([[0, 1]]), tensor([[True, True]]))
     """
-    windows, entities = free.shape
-    first = windows - num_counterfactual
-    is_chosen = _drawn(free[first:], swap_prob, generator).t()
+    count, entities = free.shape
+    first = count - num_counterfactual
+    chosen = free[first:] if windows is None else free.index_select(0, windows)
+    is_chosen = _drawn(chosen, swap_prob, generator).t()
     free = free.t()
     # rank[n, b]: the number of free windows of entity n up to and including window b.
     rank = free.cumsum(1)
-    total, own = rank[:, -1:], rank[:, first:]
+    total = rank[:, -1:]
+    own = rank[:, first:] if windows is None else rank.index_select(1, windows)
     # At least two, of which a remainder can be taken: with fewer there is no donor.
     size = total.clamp_min(2)
     pick = draw_integers(own.shape, device=free.device, generator=generator)
@@ -143,12 +182,15 @@ def draw_batch_donors(
     place = (pick % (size - 1) + own) % size
     # listed[n, r]: the free window of rank r, from 1; those that are not free end up
     # at 0.
-    starts = window_starts(windows, window, free.device).expand(entities, -1)
-    listed = rank.new_zeros(entities, windows + 2)
+    starts = window_starts(count, window, free.device).expand(entities, -1)
+    listed = rank.new_zeros(entities, count + 2)
     listed.scatter_(1, rank * free, starts)
     swapped = is_chosen & (total > 1)
     return SwapDraw(
-        listed[:, 1:].gather(1, place).t(), swapped.t(), (is_chosen ^ swapped).sum(1)
+        listed[:, 1:].gather(1, place).t(),
+        swapped.t(),
+        (is_chosen ^ swapped).sum(1),
+        windows=windows,
     )
 
 

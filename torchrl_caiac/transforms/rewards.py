@@ -18,17 +18,17 @@ RewardFn = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 def _goal_vectors(
-    td: TensorDictBase, layout: EntityLayout, first: int
+    td: TensorDictBase, layout: EntityLayout, rows: torch.Tensor
 ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """Returns the next achieved and the desired goals of the rows from ``first`` on."""
+    """Returns the next achieved and the desired goals of rows."""
     if layout.is_flat:
         desired = td.get(layout.desired_goal_key, None)
         achieved = td.get(layout.next(layout.achieved_goal_key), None)
         if achieved is None and layout.achieved:
             achieved = layout.achieved_goal(td, next=True)
         return (
-            None if achieved is None else achieved[first:],
-            None if desired is None else desired[first:],
+            None if achieved is None else achieved[rows],
+            None if desired is None else desired[rows],
         )
     achieved_parts: list[torch.Tensor] = []
     desired_parts: list[torch.Tensor] = []
@@ -46,7 +46,7 @@ def _goal_vectors(
             value = None if where is None else td.get(where, None)
             if value is None:
                 return None, None
-            value = value[first:]
+            value = value[rows]
             if isinstance(value, torch.Tensor):
                 parts.append(value.reshape(len(value), -1))
             else:
@@ -60,11 +60,11 @@ def recompute_reward(
     td: TensorDictBase,
     layout: EntityLayout,
     reward_fn: RewardFn,
-    num_rows: int,
+    rows: torch.Tensor,
     *,
     reward_key: NestedKey = ("next", "reward"),
 ) -> torch.Tensor:
-    """Computes the rewards of the last rows from their *next* achieved goals.
+    """Computes the rewards of some rows from their *next* achieved goals.
 
     Args:
         td (TensorDictBase): the batch after swapping, ``[R]``.
@@ -72,7 +72,7 @@ def recompute_reward(
             flattened, in layout order.
         reward_fn (callable): ``(next_achieved [C, G], desired [C, G])`` to rewards
             ``[C]`` or ``[C, 1]``.
-        num_rows (int): the number of rows whose rewards are recomputed, ``C``.
+        rows (torch.Tensor): int64 ``[C]``, the rows whose rewards are recomputed.
 
     Keyword Args:
         reward_key (NestedKey): the rewards ``[R]`` or ``[R, 1]``.
@@ -103,13 +103,13 @@ def recompute_reward(
         ...     },
         ...     [2],
         ... )
-        >>> recompute_reward(td, layout, lambda a, d: -(a - d).norm(dim=-1), 1)
+        >>> last = torch.tensor([1])
+        >>> recompute_reward(td, layout, lambda a, d: -(a - d).norm(dim=-1), last)
         tensor([[ 0.],
                 [-2.]])
     """
     reward = stored_reward(td, reward_key)
-    first = reward.shape[0] - num_rows
-    achieved, desired = _goal_vectors(td, layout, first)
+    achieved, desired = _goal_vectors(td, layout, rows)
     if achieved is None or desired is None:
         what = "next achieved goals" if achieved is None else "desired goals"
         raise KeyError(
@@ -117,8 +117,8 @@ def recompute_reward(
             f"{layout.desired_goal_key!r} and {layout.achieved_goal_key!r} (or its "
             "`goal` and `achieved` keys)"
         )
-    new = call_reward(reward_fn, achieved, desired, reward[first:])
-    return torch.cat([reward[:first], new])
+    new = call_reward(reward_fn, achieved, desired, reward[rows])
+    return reward.to(new.dtype).index_copy(0, rows, new)
 
 
 def stored_reward(td: TensorDictBase, reward_key: NestedKey) -> torch.Tensor:

@@ -23,8 +23,9 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.transforms.draws import SwapDraw
-from torchrl_caiac.transforms.indexing import pick_places, window_starts
+from torchrl_caiac.transforms.indexing import pick_places, window_rows, window_starts
 
 __all__ = ["SwapLeaf", "SwapPlan", "SwapPlanner", "apply_swap"]
 
@@ -299,13 +300,13 @@ def apply_swap(
     *,
     window: int = 1,
     sources: Sequence[torch.Tensor] | None = None,
-    num_source_rows: int | None = None,
+    trajectories: TrajectoryIndex | None = None,
     goals: Callable[[SwapLeaf], torch.Tensor] | None = None,
 ) -> TensorDictBase:
     """Replaces entities by those of their donors.
 
-    The states, next states, achieved goals and desired goals of the last ``C`` windows
-    follow the swap. Everything else, and all other windows, stay.
+    The states, next states, achieved goals and desired goals of the ``C`` windows of
+    the draw follow the swap. Everything else, and all other windows, stay.
 
     Args:
         td (TensorDictBase): the batch, ``[B * window]``. It is not changed.
@@ -317,8 +318,8 @@ def apply_swap(
         window (int): rows in a window. Defaults to 1.
         sources (sequence of torch.Tensor, optional): for each leaf of the plan what
             ``draw.donors`` are rows of, ``[T, ...]``; by default the batch itself.
-        num_source_rows (int, optional): rows in use in ``sources``, after which
-            windows continue at row 0 (in a full ring).
+        trajectories (TrajectoryIndex, optional): which row follows which in
+            ``sources``; by default the next one.
         goals (callable, optional): reads the desired goals ``[C, ...]`` of a leaf from
             elsewhere.
 
@@ -351,15 +352,20 @@ def apply_swap(
     changed = draw.swapped.shape[0]
     if not changed:
         return out
+    changed_rows = window_rows(draw.windows, window)
     first = td.shape[0] - changed * window
     if sources is None:
         starts = window_starts(len(td) // window, window, draw.swapped.device)
-        own = starts[-changed:].unsqueeze(-1)
+        own = starts[-changed:] if draw.windows is None else draw.windows * window
+        own = own.unsqueeze(-1)
     else:
         own = draw.donors.new_zeros(changed, 1)
     # Where nothing is swapped, a row of the batch is its own donor; one more entity,
     # which is never swapped, owns the columns that no entity owns.
     rows = torch.cat([torch.where(draw.swapped, draw.donors, own), own], -1)
+    if trajectories is not None:
+        steps = torch.arange(window, device=rows.device).view(-1, 1)
+        rows = trajectories.later(rows.unsqueeze(1), steps)
     places: dict[int, torch.Tensor] = {}
     masks: dict[tuple[int, int], torch.Tensor] = {}
     for number, leaf in enumerate(plan.leaves):
@@ -369,17 +375,24 @@ def apply_swap(
         else:
             source = value if sources is None else sources[number]
             if leaf.group not in places:
-                found = _places(rows, leaf, window, len(source), num_source_rows)
+                found = _places(rows, leaf, window, len(source))
                 places[leaf.group] = found.to(source.device)
             new = _read(source, places[leaf.group], leaf)
         if sources is not None:
             kind = leaf.group, value.ndim
             if kind not in masks:
                 masks[kind] = _mask(draw.swapped, leaf, value.ndim)
-            tail = value[first:].unflatten(0, (changed, window))
+            if changed_rows is None:
+                tail = value[first:]
+            else:
+                tail = value.index_select(0, changed_rows)
+            tail = tail.unflatten(0, (changed, window))
             new = new.to(tail.device).view(changed, -1, *tail.shape[2:])
             new = torch.where(masks[kind], new, tail).flatten(0, 1)
-        out.set(leaf.key, torch.cat([value[:first], new]))
+        if changed_rows is None:
+            out.set(leaf.key, torch.cat([value[:first], new]))
+        else:
+            out.set(leaf.key, value.index_copy(0, changed_rows, new))
     return out
 
 
@@ -393,23 +406,34 @@ def _inside(
 
 
 def _places(
-    rows: torch.Tensor, leaf: SwapLeaf, window: int, length: int, num_rows: int | None
+    rows: torch.Tensor, leaf: SwapLeaf, window: int, length: int
 ) -> torch.Tensor:
     """Finds the values of each donor window in a source of ``length`` rows.
 
-    Returns rows ``[C * window]`` for one entity's leaf; for columns, places
-    ``[C * window * D]`` in the source as one vector.
+    Args:
+        rows (torch.Tensor): the first row of each entity's donor window, ``[C, N]``, or
+            all of its rows, ``[C, window, N]``.
+        leaf (SwapLeaf): what is read.
+        window (int): rows in a window.
+        length (int): rows of the source.
+
+    Returns:
+        torch.Tensor: rows ``[C * window]`` for one entity's leaf; for columns, places
+        ``[C * window * D]`` in the source as one vector.
     """
     if isinstance(leaf.owner, int):
-        place = rows[:, leaf.owner : leaf.owner + 1]
+        place = rows[..., leaf.owner : leaf.owner + 1]
     else:
         owner = leaf.owner.to(rows.device)
-        place = rows.gather(1, owner.expand(rows.shape[0], -1))
+        place = rows.gather(-1, owner.expand(*rows.shape[:-1], -1))
     if length * leaf.width < 1 << 31:  # half as much to write and to read
         place = place.int()
-    inside = _inside(window, leaf.width, rows.device, place.dtype)
-    place = torch.add(inside, place.unsqueeze(1), alpha=leaf.width).flatten()
-    return place if num_rows is None else place % (num_rows * leaf.width)
+    if rows.ndim == 3:
+        inside = _inside(1, leaf.width, rows.device, place.dtype)
+    else:
+        inside = _inside(window, leaf.width, rows.device, place.dtype)
+        place = place.unsqueeze(1)
+    return torch.add(inside, place, alpha=leaf.width).flatten()
 
 
 def _mask(swapped: torch.Tensor, leaf: SwapLeaf, ndim: int) -> torch.Tensor:

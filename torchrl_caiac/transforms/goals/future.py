@@ -15,7 +15,7 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl_caiac._buffer_transform import BufferTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_integers, draw_numbers
-from torchrl_caiac._torchrl import storage_data
+from torchrl_caiac._torchrl import storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryCache, TrajectoryIndex
 from torchrl_caiac.transforms.checks import check_generator, check_layout
@@ -194,10 +194,10 @@ class FutureGoal(BufferTransform, SampleUnit):
             storage (TensorStorage): the sampled storage.
 
         Returns:
-            tuple: the storage's own tensordict, and the index.
+            tuple: the storage's rows ``[T]``, not copied, and the index.
         """
-        data = storage_data(storage, "the buffer")
-        assert isinstance(storage, TensorStorage)  # else storage_data raised
+        data = storage_rows(storage, "the buffer")
+        assert isinstance(storage, TensorStorage)  # else storage_rows raised
         return data, self._cache.get(storage)
 
     def set_generator(self, generator: torch.Generator | None) -> None:

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import check_number, check_reward_fn
 from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
 from torchrl_caiac.transforms.indexing import pick_rows
@@ -175,7 +176,8 @@ class HindsightGoal(FutureGoal):
         """Draws and reads a future goal for each sampled row.
 
         Args:
-            index (torch.Tensor): the sampled rows ``[B]``.
+            index (torch.Tensor or tuple of torch.Tensor): the sampled rows ``[B]``, or
+                their coordinates.
             info (dict): the sampler's information, returned as it is.
             storage (TensorStorage): the sampled storage.
 
@@ -184,8 +186,7 @@ class HindsightGoal(FutureGoal):
         """
         if self.future > 0:
             data, trajectories = self.stored(storage)
-            rows = index[0] if isinstance(index, tuple) else index
-            rows = rows.reshape(-1).to(trajectories.device)
+            rows = flat_rows(index, storage).to(trajectories.device)
             offset = draw_goal_offset(
                 trajectories.remaining(rows),
                 {self.strategy: 1.0},

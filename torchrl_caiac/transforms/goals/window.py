@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import path
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.trajectories import TrajectoryIndex
+from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_window
 from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
@@ -154,7 +154,8 @@ class WindowGoal(FutureGoal):
         """Draws and reads a goal for each sampled window.
 
         Args:
-            index (torch.Tensor): the sampled rows ``[B * window]``, window by window.
+            index (torch.Tensor or tuple of torch.Tensor): the sampled rows
+                ``[B * window]``, window by window, or their coordinates.
             info (dict): the sampler's information, returned as it is.
             storage (TensorStorage): the sampled storage.
 
@@ -165,8 +166,7 @@ class WindowGoal(FutureGoal):
             ValueError: the rows do not make up windows within trajectories. On a CUDA
                 device it is raised at a later sample, so that none waits.
         """
-        rows = index[0] if isinstance(index, tuple) else index
-        rows = rows.reshape(-1)
+        rows = flat_rows(index, storage)
         if rows.shape[0] % self.window:
             raise ValueError(
                 f"the sampler drew {rows.shape[0]} rows, not a multiple of the window "

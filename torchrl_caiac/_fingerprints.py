@@ -1,0 +1,210 @@
+"""Fingerprints of states, which tie a score to the state it was computed from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import torch
+from tensordict import TensorDictBase, is_tensor_collection
+from tensordict.utils import NestedKey
+
+from torchrl_caiac._keys import join, path
+
+__all__ = [
+    "fingerprint",
+    "fingerprint_key",
+    "is_fingerprint_of",
+    "rows_with_fingerprints",
+    "settings_of",
+    "state_hash",
+]
+
+# The upper half of a fingerprint less the hash of its states; settings are the lower.
+_MAGIC = 0x43414943
+_MASK = (1 << 64) - 1
+# The hash of the next state enters with this factor, so that it is no longer a hash of
+# the same kind as that of the state.
+_NEXT = 0x9E3779B97F4A7C15
+
+
+def fingerprint_key(score_key: NestedKey) -> NestedKey:
+    """Returns the key of the fingerprints, int64 ``[T]``, of some scores.
+
+    Args:
+        score_key (NestedKey): the key of the scores.
+
+    Returns:
+        NestedKey: the key beside it.
+
+    Examples:
+        >>> from torchrl_caiac._fingerprints import fingerprint_key
+        >>> fingerprint_key(("caiac", "score"))
+        ('caiac', 'score_fingerprint')
+    """
+    *parents, name = path(score_key)
+    return join(*parents, f"{name}_fingerprint")
+
+
+def state_hash(td: TensorDictBase, keys: Sequence[NestedKey]) -> torch.Tensor | None:
+    """Returns a hash of the bits of a state.
+
+    A change of a single value always changes the hash. A change of several values is
+    missed with a probability of about 2**-40, or of 2**-10 if all of them are small
+    multiples of a power of two.
+
+    Args:
+        td (TensorDictBase): the states, ``[B]``.
+        keys (sequence of NestedKey): their entries.
+
+    Returns:
+        torch.Tensor, optional: int64 ``[B]``; ``None`` if an entry is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._fingerprints import state_hash
+        >>> states = torch.tensor([[1.0, 2.0], [1.0, 2.5]])
+        >>> td = TensorDict({"observation": states}, [2])
+        >>> first, second = state_hash(td, ["observation"])
+        >>> bool(first == second)
+        False
+    """
+    total: torch.Tensor | None = None
+    number = 0
+    for key in keys:
+        value = td.get(key, None)
+        if value is None:
+            return None
+        leaves = [value]
+        if is_tensor_collection(value):
+            names = sorted(value.keys(True, True), key=path)
+            leaves = [value.get(name) for name in names]
+        for leaf in leaves:
+            if not isinstance(leaf, torch.Tensor) or not leaf.numel():
+                continue
+            lanes = _lanes(leaf.as_subclass(torch.Tensor))
+            weights = _weights(lanes.shape[1], number, lanes.device)
+            if lanes.device.type == "cpu":
+                found = torch.mv(lanes, weights)
+            else:  # integers have no matrix products on other devices
+                found = (lanes * weights).sum(-1)
+            total = found if total is None else total + found
+            number += 1
+    return total
+
+
+def fingerprint(
+    state: torch.Tensor, after: torch.Tensor | None, settings: int
+) -> torch.Tensor:
+    """Returns the fingerprints of rows.
+
+    Args:
+        state (torch.Tensor): int64 ``[B]``, the hashes of their states.
+        after (torch.Tensor, optional): int64 ``[B]``, those of their next states.
+        settings (int): what else the scores depend on, 32 bits.
+
+    Returns:
+        torch.Tensor: int64 ``[B]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac._fingerprints import (
+        ...     fingerprint, is_fingerprint_of, settings_of
+        ... )
+        >>> state, after = torch.tensor([5, 6]), torch.tensor([7, 8])
+        >>> known = fingerprint(state, after, settings=3)
+        >>> is_fingerprint_of(known, state, after.flip(0))
+        tensor([False, False])
+        >>> settings_of(known, state, after)
+        tensor([3, 3])
+    """
+    return _joint(state, after) + _signed((_MAGIC << 32) | (settings & 0xFFFFFFFF))
+
+
+def is_fingerprint_of(
+    known: torch.Tensor, state: torch.Tensor, after: torch.Tensor | None
+) -> torch.Tensor:
+    """Returns which rows still have the states of their fingerprints, bool ``[B]``."""
+    return (known - _joint(state, after)) >> 32 == _MAGIC
+
+
+def settings_of(
+    known: torch.Tensor, state: torch.Tensor, after: torch.Tensor | None
+) -> torch.Tensor:
+    """Returns the settings of rows, int64 ``[B]``, meaningless where states differ."""
+    return (known - _joint(state, after)) & 0xFFFFFFFF
+
+
+def rows_with_fingerprints(
+    td: TensorDictBase,
+    known: torch.Tensor,
+    keys: Sequence[NestedKey],
+    next_keys: Sequence[NestedKey],
+    *,
+    batch_size: int = 1 << 16,
+) -> torch.Tensor:
+    """Returns which rows of a storage still have the states of their fingerprints.
+
+    Args:
+        td (TensorDictBase): the rows, ``[T]``.
+        known (torch.Tensor): the fingerprints, int64 ``[T]``.
+        keys (sequence of NestedKey): the entries of states.
+        next_keys (sequence of NestedKey): the entries of next states.
+
+    Keyword Args:
+        batch_size (int): rows that are read at a time. Defaults to 65,536.
+
+    Returns:
+        torch.Tensor: bool ``[T]``.
+    """
+    found = torch.zeros(len(known), dtype=torch.bool, device=known.device)
+    for start in range(0, len(known), batch_size):
+        part = td[start : start + batch_size]
+        state, after = state_hash(part, keys), state_hash(part, next_keys)
+        if state is not None:
+            rows = slice(start, start + len(part))
+            found[rows] = is_fingerprint_of(known[rows], state, after)
+    return found
+
+
+def _joint(state: torch.Tensor, after: torch.Tensor | None) -> torch.Tensor:
+    if after is None:
+        return state
+    return torch.add(state, after, alpha=_signed(_NEXT))
+
+
+def _lanes(leaf: torch.Tensor) -> torch.Tensor:
+    """Returns the bits of a leaf ``[B, ...]`` as int64 ``[B, L]``."""
+    flat = leaf.reshape(len(leaf), -1)
+    if flat.dtype.is_complex:
+        flat = torch.view_as_real(flat).flatten(1)
+    if flat.is_floating_point():
+        flat = flat.contiguous()
+        if flat.dtype.itemsize == 2:
+            return flat.view(torch.int16).long()
+        if flat.dtype.itemsize == 4 and flat.shape[1] % 2:
+            flat = torch.nn.functional.pad(flat, (0, 1))
+        if flat.dtype.itemsize == 8:
+            # The upper half of a value has its leading bits. Moved to a lower half,
+            # they reach more bits of the hash.
+            flat = flat.view(torch.int32).roll(-1, 1)
+        return flat.view(torch.int64)
+    return flat.long()
+
+
+@lru_cache(maxsize=256)
+def _weights(width: int, number: int, device: torch.device) -> torch.Tensor:
+    """Returns odd random weights of the lanes of a leaf, int64 ``[width]``."""
+    found = []
+    seed = (number + 1) * 0xD1B54A32D192ED03 & _MASK
+    for _ in range(width):  # SplitMix64, the same on every machine
+        seed = (seed + _NEXT) & _MASK
+        mixed = ((seed ^ (seed >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+        mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) & _MASK
+        found.append(_signed((mixed ^ (mixed >> 31)) | 1))
+    return torch.tensor(found, dtype=torch.int64, device=device)
+
+
+def _signed(number: int) -> int:
+    return number - (1 << 64) if number >> 63 else number

@@ -1,0 +1,305 @@
+"""Checks of the values of each batch that a transform augments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+
+from torchrl_caiac._fingerprints import fingerprint_key, is_fingerprint_of, state_hash
+from torchrl_caiac._keys import missing_key
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY
+from torchrl_caiac.transforms.checks import LateCheck
+from torchrl_caiac.transforms.keys import TransformKeys
+
+__all__ = ["BatchCheck", "CheckedScores"]
+
+# The mean distance of a state from the next state of the row before it, in the largest
+# steps of the batch, up to which both may be recordings of one state.
+_NOISE = 0.5
+
+
+class CheckedScores(NamedTuple):
+    """The scores of a batch that may be used.
+
+    Attributes:
+        scores (torch.Tensor): ``[B * window, ...]``, NaN where they may not be used.
+        unscored (torch.Tensor, optional): int64, the number of such rows, if counted.
+        is_wrong (torch.Tensor, optional): bool, whether a row has the score of another
+            state; on accelerators, where it is not read at once.
+        crosses (torch.Tensor, optional): bool ``[B, window - 1]``, the steps of windows
+            that are not steps of a trajectory.
+    """
+
+    scores: torch.Tensor
+    unscored: torch.Tensor | None
+    is_wrong: torch.Tensor | None
+    crosses: torch.Tensor | None
+
+
+class BatchCheck:
+    """Raises if the values of a batch are invalid.
+
+    Scores must be those of the states that they come with, scores and observations must
+    be finite, and windows must be successive rows of a trajectory. On a CUDA device
+    nothing waits for the result: an error is raised at a later batch.
+
+    Args:
+        layout (EntityLayout): the entities.
+
+    Keyword Args:
+        score_key (NestedKey): the scores.
+        window (int): rows in a window.
+        keys (TransformKeys): trajectory ids and end flags.
+        scores_name (str): the name of the scores in error messages.
+        unscored (str): ``"raise"``, or ``"keep"`` to count rows without valid scores.
+    """
+
+    def __init__(
+        self,
+        layout: EntityLayout,
+        *,
+        score_key: NestedKey,
+        window: int,
+        keys: TransformKeys,
+        scores_name: str,
+        unscored: Literal["raise", "keep"],
+    ) -> None:
+        self.layout = layout
+        self.score_key = score_key
+        self.window = window
+        self.keys = keys
+        self.scores_name = scores_name
+        self.unscored: Literal["raise", "keep"] = unscored
+        self._fingerprint_key = fingerprint_key(score_key)
+        self._next_keys = [layout.next(key) for key in layout.in_keys]
+        self._late = LateCheck()
+
+    def before(self, td: TensorDictBase, scores: torch.Tensor) -> CheckedScores:
+        """Checks a batch before it is swapped.
+
+        Args:
+            td (TensorDictBase): the batch, ``[B * window]``.
+            scores (torch.Tensor): its scores, ``[B * window, ...]``.
+
+        Returns:
+            CheckedScores: what may be used.
+
+        Raises:
+            KeyError: windows have neither trajectory ids nor end flags.
+            ValueError: a score is missing, infinite or that of another state; or the
+                rows of a window do not follow each other.
+        """
+        known = td.get(self._fingerprint_key, None)
+        state = after = is_valid = None
+        if known is not None or self.window > 1:
+            state = state_hash(td, self.layout.in_keys)
+            after = state_hash(td, self._next_keys)
+        if known is not None and state is not None:
+            is_valid = is_fingerprint_of(known, state, after)
+        crosses = None
+        if self.window > 1:
+            crosses = self._crossings(td)
+            if state is not None and after is not None:
+                crosses = crosses | self._gaps(td, state, after)
+        if not LateCheck.needed(scores.device) and crosses is not None:
+            if bool(crosses.any()):
+                self._explain_windows(td, crosses)
+            crosses = None
+        if self.unscored == "keep":
+            return self._kept(scores, is_valid, crosses)
+        if LateCheck.needed(scores.device):
+            is_wrong = None if is_valid is None else ~is_valid.all()
+            return CheckedScores(scores, None, is_wrong, crosses)
+        # A sum is finite if all its terms are.
+        if not math.isfinite(scores.sum().item()):
+            self._explain_scores(scores)
+        if is_valid is not None and not bool(is_valid.all()):
+            self._explain_fingerprints(is_valid)
+        return CheckedScores(scores, None, None, None)
+
+    def after(
+        self, td: TensorDictBase, checked: CheckedScores, states: Sequence[NestedKey]
+    ) -> None:
+        """Checks a batch after it was swapped.
+
+        Args:
+            td (TensorDictBase): the batch after swapping.
+            checked (CheckedScores): from :meth:`before`.
+            states (sequence of NestedKey): the floating-point leaves of its states.
+
+        Raises:
+            ValueError: a value is not finite; on a CUDA device, also what
+                :meth:`before` raises elsewhere.
+        """
+        leaves = [td.get(key) for key in states]
+        if not LateCheck.needed(checked.scores.device):
+            if not math.isfinite(sum(leaf.sum().item() for leaf in leaves)):
+                self._explain_states(td, states)
+            return
+        found = self._late.found()
+        if found:
+            # The newest batch is likely to have the same fault.
+            if checked.crosses is not None and bool(checked.crosses.any()):
+                self._explain_windows(td, checked.crosses)
+            if self.unscored == "raise":
+                self._explain_scores(checked.scores)
+            self._explain_states(td, states)
+            names = [self.score_key, "fingerprints", "the windows", *states]
+            raise ValueError(
+                f"{[names[place] for place in found]} were invalid in an earlier "
+                f"batch: {self.scores_name} or observations are NaN or infinite, "
+                f"{self.scores_name} are those of other states, or windows cross a "
+                "trajectory's end. On a CUDA device errors are late; sample the same "
+                "data on the CPU to find the rows"
+            )
+        scores = checked.scores
+        if self.unscored == "keep":
+            scores = scores.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
+        zero = scores.new_zeros((), dtype=torch.float64)
+        flags = [
+            zero if flag is None else torch.where(flag.any(), math.nan, zero)
+            for flag in (checked.is_wrong, checked.crosses)
+        ]
+        sums = [leaf.sum(dtype=torch.float64) for leaf in (scores, *leaves)]
+        self._late.add(torch.stack([sums[0], *flags, *sums[1:]]))
+
+    # --- scores ----------------------------------------------------------------------
+
+    def _kept(
+        self,
+        scores: torch.Tensor,
+        is_valid: torch.Tensor | None,
+        crosses: torch.Tensor | None,
+    ) -> CheckedScores:
+        if not LateCheck.needed(scores.device) and bool(scores.isinf().any()):
+            self._explain_scores(scores)
+        if is_valid is not None:
+            where = is_valid.view(-1, *(1,) * (scores.ndim - 1))
+            scores = torch.where(where, scores, math.nan)
+        unscored = scores.isnan().flatten(1).any(1).sum()
+        return CheckedScores(scores, unscored, None, crosses)
+
+    def _explain_scores(self, scores: torch.Tensor) -> None:
+        nan, infinite = scores.isnan(), scores.isinf()
+        if nan.any():
+            rows = int(nan.flatten(1).any(1).sum())
+            raise ValueError(
+                f"{self.score_key!r} is NaN, that is not scored, in {rows} of "
+                f"{scores.shape[0]} rows for {self._entities(nan)}: call score_buffer "
+                "on the replay buffer after extending it, or pass unscored='keep'"
+            )
+        if infinite.any():
+            raise ValueError(
+                f"{self.score_key!r} is infinite for {self._entities(infinite)}: check "
+                "the influence measure, then call score_buffer(..., overwrite=True)"
+            )
+
+    def _explain_fingerprints(self, is_valid: torch.Tensor) -> None:
+        rows = int((~is_valid).sum())
+        raise ValueError(
+            f"{rows} of {len(is_valid)} rows have {self.scores_name} in "
+            f"{self.score_key!r} of other states than their own: call score_buffer on "
+            "the replay buffer after writing to it, or pass unscored='keep'. If all "
+            "rows are named, another transform may have changed the state before: "
+            "append this one first"
+        )
+
+    def _entities(self, bad: torch.Tensor) -> list[str]:
+        """Returns the entities that have a bad score, ``[*, N]``."""
+        columns = bad.reshape(-1, bad.shape[-1]).any(0).nonzero()[:, 0]
+        return [self.layout.names[column] for column in columns.tolist()]
+
+    # --- windows ---------------------------------------------------------------------
+
+    def _crossings(self, td: TensorDictBase) -> torch.Tensor:
+        """Returns where a window leaves its trajectory, bool ``[B, window - 1]``."""
+        if td.get(STEPS_KEY, None) is not None:
+            raise ValueError(
+                f"the batch has {STEPS_KEY!r}, so that its next states are several "
+                f"steps later, but windows of {self.window} rows are single steps: "
+                "sample windows from data without MultiStepTransform"
+            )
+        found = None
+        ids = None
+        if self.keys.trajectory is not None:
+            ids = td.get(self.keys.trajectory, None)
+            if ids is None:
+                ids = td.get(COLLECTOR_KEY, None)
+            if ids is not None:
+                ids = ids.reshape(-1, self.window)
+                found = ids[:, 1:] != ids[:, :-1]
+        if self.keys.done is not None:
+            done = td.get(self.keys.done, None)
+            if done is not None:
+                ended = done.reshape(-1, self.window)[:, :-1].bool()
+                found = ended if found is None else found | ended
+        if found is None:
+            raise missing_key(
+                td,
+                [key for key in (self.keys.trajectory, self.keys.done) if key],
+                "the batch lacks trajectory ids and end flags,",
+                "name the one that it has with keys=TransformKeys(trajectory=..., "
+                "done=...), since a window must not leave its trajectory",
+            )
+        return found
+
+    def _gaps(
+        self, td: TensorDictBase, state: torch.Tensor, after: torch.Tensor
+    ) -> torch.Tensor:
+        """Returns where a row is not the one after the row before it.
+
+        A row follows another one if its state is the other's next state. Both may be
+        separate, noisy recordings, so states that differ are compared by distance.
+        """
+        state, after = state.view(-1, self.window), after.view(-1, self.window)
+        differs = state[:, 1:] != after[:, :-1]
+        if not LateCheck.needed(state.device) and not bool(differs.any()):
+            return differs
+        # A sampler that pads windows repeats rows.
+        repeats = (state[:, 1:] == state[:, :-1]) & (after[:, 1:] == after[:, :-1])
+        here = self.layout.read(td).double()
+        there = self.layout.read(td, next=True).double()
+        largest = (there - here).abs().amax(0)
+        size = largest.clamp_min(1e-6 * here.abs().amax(0)).clamp_min(1e-12)
+        here = here.view(-1, self.window, here.shape[-1])[:, 1:]
+        there = there.view(-1, self.window, there.shape[-1])[:, :-1]
+        distance = ((here - there).abs() / size).mean(-1)
+        return differs & (repeats | ~(distance <= _NOISE))
+
+    def _explain_windows(self, td: TensorDictBase, crosses: torch.Tensor) -> None:
+        window = int(crosses.any(1).nonzero()[0, 0])
+        where = f"window {window} of {self.window} rows"
+        if bool(self._crossings(td).any()):
+            raise ValueError(
+                f"{where} crosses a trajectory's end "
+                f"according to {self.keys.trajectory!r} or {self.keys.done!r}: use "
+                f"SliceSampler with slice_len={self.window}, strict_length=True and "
+                "trajectories of at least this length. If end flags do not end a "
+                "trajectory in these data, pass keys=TransformKeys(done=None)"
+            )
+        step = int(crosses[window].nonzero()[0, 0])
+        raise ValueError(
+            f"the rows of {where} do not follow each other: the state of row "
+            f"{step + 1} is not the next state of row {step}. Use SliceSampler with "
+            f"slice_len={self.window}, strict_length=True and no padding; see "
+            "check_dataset if the stored rows are out of order"
+        )
+
+    # --- states ----------------------------------------------------------------------
+
+    def _explain_states(self, td: TensorDictBase, states: Sequence[NestedKey]) -> None:
+        for key in states:
+            bad = ~td.get(key).isfinite()
+            if bad.any():
+                row = int(bad.flatten(1).any(1).nonzero()[0, 0])
+                raise ValueError(
+                    f"{key!r} is not finite (NaN or infinite) in {int(bad.sum())} "
+                    f"values, first in row {row} of the batch: clean the data, or "
+                    "the donors' data"
+                )
