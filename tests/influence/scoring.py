@@ -69,12 +69,12 @@ def episodes(lengths, *, width=3, seed=0, first_id=0):
     return torch.cat(out)
 
 
-def storage_of(kind, size, tmp_path):
+def storage_of(kind, size, tmp_path, **kwargs):
     if kind == "memory":
-        return LazyTensorStorage(size)
+        return LazyTensorStorage(size, **kwargs)
     if kind == "memmap":
-        return LazyMemmapStorage(size, scratch_dir=tmp_path / "data")
-    return LazyMemmapStorage(size)
+        return LazyMemmapStorage(size, scratch_dir=tmp_path / "data", **kwargs)
+    return LazyMemmapStorage(size, **kwargs)
 
 
 def filled(rows, kind="memory", size=None, tmp_path=None, **kwargs):

@@ -221,7 +221,7 @@ def test_every_is_a_setting_and_resumes(tmp_path):
         score_buffer(rb, Failing(4), 8, **options)
     score_buffer(rb, Failing(-1), 8, **options)
     assert torch.equal(scores(rb), scores(whole))
-    with pytest.raises(ValueError, match="every was 4, is None"):
+    with pytest.raises(ValueError, match="every was 4, is 1"):
         score_buffer(rb, Failing(-1), 8, smoothing=3, progress=False)
     with pytest.raises(ValueError, match="every was 4, is 2"):
         score_buffer(rb, Failing(-1), 8, **{**options, "every": 2})
@@ -385,10 +385,6 @@ def test_rejects_bad_buffers():
     rb = ReplayBuffer(storage=LazyTensorStorage(3))
     rb.extend(torch.zeros(3, 2))
     with pytest.raises(TypeError, match="contains a Tensor"):
-        score_buffer(rb, Read())
-    rb = ReplayBuffer(storage=LazyTensorStorage(6, ndim=2))
-    rb.extend(episodes([6]).reshape(2, 3))
-    with pytest.raises(ValueError, match="ndim=2"):
         score_buffer(rb, Read())
 
 

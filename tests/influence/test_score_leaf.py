@@ -19,7 +19,9 @@ from tests.influence.scoring import (
     filled,
     scores,
     square,
+    storage_of,
 )
+from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac.influence import (
     score_buffer,
     score_file,
@@ -50,9 +52,12 @@ def test_two_leaves_with_different_settings(tmp_path):
     score_buffer(rb, Read(), progress=False)
     score_buffer(rb, Read(2.0), key="other", progress=False)
     torch.testing.assert_close(scores(rb, "other"), 4 * scores(rb))
-    rb.extend(episodes([12], first_id=50))
-    assert scores(rb).isnan().all()
-    assert scores(rb, "other").isnan().all()
+    rb.extend(episodes([12], first_id=50, seed=5))
+    score_buffer(rb, Read(), progress=False)
+    torch.testing.assert_close(scores(rb), definition(rb.storage[:], square, 1, 1))
+    estimator = Read(2.0)
+    score_buffer(rb, estimator, key="other", progress=False)
+    assert sum(estimator.rows) == 13
 
 
 @pytest.mark.parametrize("kind", ["memory", "memmap"])
@@ -77,8 +82,46 @@ def test_a_leaf_of_another_origin_is_replaced_only_on_request(kind, leaf, tmp_pa
     if kind == "memmap":
         again = TensorDict.load_memmap(tmp_path / "data")
         assert torch.equal(again[KEY], scores(rb))
-    rb.extend(rows)
-    assert scores(rb).isnan().all()
+
+
+def test_scores_without_fingerprints_are_not_taken_for_ones_of_this_package():
+    rb = filled(episodes([5, 7]).set(KEY, torch.zeros(12, 3)))
+    with pytest.raises(ValueError, match=r"without fingerprints .*overwrite=True"):
+        score_buffer(rb, Read(), progress=False)
+    rb.storage[:][KEY].fill_(torch.nan)  # none of them is one
+    score_buffer(rb, Read(), progress=False)
+    torch.testing.assert_close(scores(rb), definition(rb.storage[:], square, 1, 1))
+
+
+def test_another_leaf_in_the_place_of_the_fingerprints():
+    rb = filled(episodes([5, 7]).set(fingerprint_key(KEY), torch.zeros(12)))
+    rb.storage[:][KEY] = torch.zeros(12, 3)
+    with pytest.raises(ValueError, match=r"score_fingerprint.*float32 \[12\].*int64"):
+        score_buffer(rb, Read(), progress=False)
+
+
+def test_a_storage_with_two_dimensions(tmp_path):
+    columns = [episodes([4, 3], seed=i, first_id=10 * i) for i in range(3)]
+    for kind in ("memory", "memmap"):
+        rb = ReplayBuffer(
+            storage=storage_of(kind, 21, tmp_path, ndim=2), dim_extend=0, batch_size=4
+        )
+        rb.extend(torch.stack(columns, 1))
+        score_buffer(rb, Read(), 4, smoothing=3, lookahead=2, progress=False)
+        assert rb.storage[:][KEY].shape == (7, 3, 3)
+        for i, column in enumerate(columns):
+            found = rb.storage[:][KEY][:, i]
+            torch.testing.assert_close(found, definition(column, square, 3, 2))
+        # Two more steps of each environment, over the oldest ones.
+        rb.extend(torch.stack([episodes([2], seed=i + 7) for i in range(3)], 1))
+        score_buffer(rb, Read(), 4, smoothing=3, lookahead=2, progress=False)
+        order = [*range(2, 7), 0, 1]
+        for i in range(3):
+            stored = rb.storage[:][:, i]
+            expected = definition(stored, square, 3, 2, order)
+            torch.testing.assert_close(stored[KEY][:2], expected[:2])
+    again = TensorDict.load_memmap(tmp_path / "data")
+    assert torch.equal(again[KEY], rb.storage[:][KEY])
 
 
 def test_nothing_is_written_if_the_estimator_does_not_fit(tmp_path):

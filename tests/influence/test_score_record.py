@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.checkpoint import Checkpoint
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
@@ -33,19 +34,33 @@ from torchrl_caiac.modules import GaussianWorldModel
 
 
 @pytest.mark.parametrize("kind", ["memory", "memmap"])
-def test_dumps_and_loads_keep_the_scores_without_the_record(kind, tmp_path):
+@pytest.mark.parametrize("way", ["dumps", "state_dict", "Checkpoint"])
+def test_saved_and_loaded_scores_are_good(kind, way, tmp_path):
     rb = filled(episodes([5, 7]), kind, 20, tmp_path)
     score_buffer(rb, Read(), progress=False)
     rb.dumps(tmp_path / "saved")
+    Checkpoint(rb=rb).save(tmp_path / "checkpoint")
     for other in (LazyTensorStorage(20), LazyMemmapStorage(20)):
         loaded = ReplayBuffer(storage=other, batch_size=4)
-        loaded.loads(tmp_path / "saved")
+        if way == "dumps":
+            loaded.loads(tmp_path / "saved")
+        elif way == "state_dict":
+            loaded.load_state_dict(rb.state_dict())
+        else:
+            Checkpoint(rb=loaded).load(tmp_path / "checkpoint")
         assert torch.equal(scores(loaded), scores(rb))
         assert not loaded.sample()[KEY].isnan().any()
-        with pytest.raises(ValueError, match="without a record"):
-            score_buffer(loaded, Read(), progress=False)
-        score_buffer(loaded, Read(), overwrite=True, progress=False)
-        assert torch.equal(scores(loaded), scores(rb))
+        estimator = Read()
+        score_buffer(loaded, estimator, progress=False)
+        assert estimator.rows == []
+        with pytest.raises(ValueError, match="have other settings"):
+            score_buffer(loaded, Read(2.0), progress=False)
+        # A row that is written later is the only one that is scored again.
+        loaded.extend(episodes([1], seed=3, first_id=9))
+        score_buffer(loaded, estimator, progress=False)
+        expected = definition(loaded.storage[:], square, 1, 1)
+        torch.testing.assert_close(scores(loaded), expected)
+        assert sum(estimator.rows) <= 4
 
 
 def test_interrupted_before_the_leaf_was_initialized(tmp_path):
@@ -107,7 +122,7 @@ def test_modes_of_cai_are_never_mixed():
         ('{"something": 1}', "not a score file"),
         ("[1]", "not a score file"),
         ('{"format": "torchrl_caiac.scores", "version": 99}', "version 99"),
-        ('{"format": "torchrl_caiac.scores", "version": 1}', "incomplete"),
+        ('{"format": "torchrl_caiac.scores", "version": 2}', "incomplete"),
     ],
 )
 def test_rejects_a_bad_score_file(text, match, tmp_path):

@@ -47,6 +47,9 @@ __all__ = ["score_buffer"]
 _logger = logging.getLogger("torchrl_caiac.influence.score_buffer")
 # Passes over a buffer that others write to, before rows are left unscored.
 _MOST_PASSES = 10
+# The score of a row whose transition passes through states that are not stored: it
+# counts as influenced.
+_UNKNOWN = 1e30
 
 
 @torch.no_grad()
@@ -84,6 +87,9 @@ def score_buffer(
 
     An estimator whose ``in_keys`` contain more than the state (attention reads the
     action) cannot score the state after the last row; :math:`r_n` is then left out.
+
+    Rows of :class:`~torchrl.envs.MultiStepTransform`, whose next states are several
+    steps later, count as influenced if a state in between is not stored yet.
 
     For a slow estimator, ``every`` reduces the number of states that are scored: only
     :math:`r_0, r_e, r_{2e}, \dots` of each trajectory are computed. A state in between
@@ -215,7 +221,7 @@ def score_buffer(
                 "every=1"
             )
         data = storage_rows(storage)
-        _check_steps(data, index.length, lookahead)
+        steps = _steps(data, index.length, lookahead)
         scorer = Scorer(
             data,
             estimator,
@@ -236,6 +242,7 @@ def score_buffer(
             layout,
             key,
             settings,
+            steps,
             overwrite=overwrite and not number,
             progress=progress,
         )
@@ -260,6 +267,7 @@ def _one_pass(
     layout: EntityLayout,
     key: NestedKey,
     settings: dict[str, Any],
+    steps: torch.Tensor | None,
     *,
     overwrite: bool,
     progress: bool,
@@ -277,7 +285,9 @@ def _one_pass(
             leaves = new_leaves(storage, key, feature_shape)
             write_record(storage, data, key, settings, layout, "scoring")
             stale = torch.ones(index.length, dtype=torch.bool)
-            _score(scorer, index, leaves, stale, is_first=True, progress=progress)
+            _score(
+                scorer, index, leaves, stale, steps, is_first=True, progress=progress
+            )
             write_record(storage, data, key, settings, layout, "scored")
     else:
         scorer.feature_shape = tuple(leaves.scores.shape[1:])
@@ -290,7 +300,15 @@ def _one_pass(
         stale = stale[index.rows(every_position).cpu()]
         with _claimed(data):
             write_record(storage, data, key, settings, layout, "scoring")
-            _score(scorer, index, leaves, stale, is_first=is_first, progress=progress)
+            _score(
+                scorer,
+                index,
+                leaves,
+                stale,
+                steps,
+                is_first=is_first,
+                progress=progress,
+            )
             write_record(storage, data, key, settings, layout, "scored")
     add_revision(storage)
     return False
@@ -340,6 +358,7 @@ def _score(
     index: TrajectoryIndex,
     leaves: ScoreLeaves,
     stale: torch.Tensor,
+    steps: torch.Tensor | None,
     *,
     is_first: bool,
     progress: bool,
@@ -351,6 +370,7 @@ def _score(
         index (TrajectoryIndex): the trajectories.
         leaves (ScoreLeaves): where they are written.
         stale (torch.Tensor): bool ``[T]`` by position.
+        steps (torch.Tensor, optional): ``[T]``, the steps to the next states.
 
     Keyword Args:
         is_first (bool): whether chunks are scored as a whole, so that an interrupted
@@ -397,6 +417,8 @@ def _score(
             else:
                 chosen = is_near.nonzero()[:, 0] + scorer.span(c).start
                 found, fingerprints = scorer.some(chosen)
+            if steps is not None:
+                found[_is_cut(index, rows, steps)] = _UNKNOWN
             rows = rows.to(scores.device)
             # The fingerprints last: without them the scores do not count.
             scores[rows] = found.to(scores.device)
@@ -404,18 +426,35 @@ def _score(
             bar.update(len(rows))
 
 
-def _check_steps(data: TensorDictBase, length: int, lookahead: int) -> None:
-    """Raises if next states are farther away than the lookahead."""
-    steps = data.get(STEPS_KEY, None)
-    if steps is None:
-        return
-    most = int(steps[:length].max())
+def _steps(data: TensorDictBase, length: int, lookahead: int) -> torch.Tensor | None:
+    """Returns the steps from states to next states, ``[T]``, where they are stored.
+
+    Raises:
+        ValueError: they are more than the lookahead.
+    """
+    leaf = data.get(STEPS_KEY, None)
+    if leaf is None:
+        return None
+    steps = leaf.as_subclass(torch.Tensor)[:length].reshape(length)
+    most = int(steps.max())
     if most > lookahead:
         raise ValueError(
             f"the next states are up to {most} steps later, see {STEPS_KEY!r}, but "
             f"lookahead is {lookahead}: an entity that is influenced in between would "
             f"count as uninfluenced. Use lookahead={most} or more"
         )
+    return steps
+
+
+def _is_cut(
+    index: TrajectoryIndex, rows: torch.Tensor, steps: torch.Tensor
+) -> torch.Tensor:
+    """Returns the rows for which a state up to the next one is not stored."""
+    left = index.remaining(rows)
+    end = index.later(rows.to(index.device), left)
+    # The last row has one more state, if that is the one right after it.
+    known = left + (steps[end.to(steps.device)] == 1).to(left.device)
+    return (steps[rows.to(steps.device)].to(left.device) > known).cpu()
 
 
 def _claimed(data: TensorDictBase) -> AbstractContextManager[None]:
