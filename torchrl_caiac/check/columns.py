@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -24,6 +24,7 @@ __all__ = ["Unowned", "check_columns", "check_goals", "unowned_columns"]
 _MAX_COLUMNS = 512  # wider entries, such as images, are left out
 _ROWS = 20_000  # rows of the regression
 _EXPLAINED = 0.999  # of the variance, in trajectories that were held out
+_LONG = 1_000  # rows from which the halves of a single trajectory do
 _RIDGE = 1e-10
 _BOOKKEEPING = {"action", "reward", "done", "terminated", "truncated", "step_count"}
 
@@ -94,7 +95,7 @@ def check_columns(
     sample: Sample,
     states: States,
     unowned: Iterator[Unowned],
-    still: Sequence[str],
+    still: Collection[str],
 ) -> list[Finding]:
     """Finds columns that are copies, constant, or linear functions of others.
 
@@ -103,7 +104,7 @@ def check_columns(
         sample (Sample): the rows.
         states (States): their states.
         unowned (iterator of Unowned): the columns that no entity owns.
-        still (sequence of str): entities that never move, reported already.
+        still (collection of str): names of columns of entities that never move.
 
     Returns:
         list of Finding: what was found.
@@ -118,7 +119,7 @@ def check_columns(
         for label, name, is_constant in zip(
             states.labels, owner, constant.tolist(), strict=True
         )
-        if is_constant and name not in still and name not in layout.fixed
+        if is_constant and label not in still and name not in layout.fixed
     ]
     if columns:
         message = f"the same value in all checked rows: {named(columns)}"
@@ -149,6 +150,7 @@ def check_columns(
         label
         for c, label in enumerate(states.labels)
         if label not in copied
+        and label not in still
         and owner[c] not in layout.fixed
         and regression.is_mixed(c, owner)
     ]
@@ -265,9 +267,10 @@ class _Regression:
         stride = -(-len(sample) // _ROWS)
         chosen = torch.arange(0, len(sample), stride)
         piece = sample.piece[chosen].unique(return_inverse=True)[1]
-        pieces = int(piece.max()) + 1
         half = piece % 2 == 0
-        if pieces < 4:
+        if int(piece.max()) < 3:
+            if len(chosen) < _LONG:
+                return None
             half = torch.arange(len(chosen)) < len(chosen) // 2
         x = states.now[chosen].double()
         loc, scale = x[half].mean(0), x.std(0, correction=0)

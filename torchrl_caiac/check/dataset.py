@@ -294,7 +294,7 @@ class _Check:
             sample, states = sample.keep(good), states.keep(good)
         if not len(sample):
             return
-        still: list[str] = []
+        still: set[str] = set()
         hidden: set[str] = set()
         if states.after is not None:
             links = self._check_succession(sample, states, index)
@@ -306,11 +306,12 @@ class _Check:
                 found = check_motion(*chosen, layout.fixed, self.floors)
                 found += check_jumps(*chosen)
                 self.findings += found
-            still = [
-                name
-                for name, where in states.slices.items()
-                if bool((states.next[:, where] == states.now[:, where]).all())
-            ]
+            still = {
+                column
+                for found in self.findings
+                if found.code in ("never_moves", "next_equals_state")
+                for column in found.columns
+            }
         left_out = [self.action_key, self.reward_key, self.trajectory_key]
         unowned = unowned_columns(
             layout, data, sample, [*left_out, self.done_key, *self.time_keys]

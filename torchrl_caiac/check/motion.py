@@ -20,6 +20,7 @@ _ALWAYS = 0.999  # of the rows
 _REST = 0.01  # of a large change: smaller ones do not count as motion
 _LARGE = 0.1  # of a large change: the rows in which the entity moves for sure
 _NEGLIGIBLE = 1e-5  # of the largest deviation of a column: the jitter of a simulator
+_LEAVES = 5.0  # times the floor: a column that travels less may be at rest
 _FLOOR = 1e-3  # of the median change: the variance floor is too low
 _JUMP = 20.0  # times the change that 0.5 % of the changes exceed
 _ROBUST_Z = 50.0
@@ -52,19 +53,28 @@ def check_motion(
     moved: dict[str, _Motion] = {}
     for name, where in states.slices.items():
         floor = None if floors is None else floors.get(name)
-        moved[name] = _Motion.of(states, where, floor)
+        moved[name] = _Motion.of(sample, states, where, floor)
     # If not even the robot moves by more than the floors, their units are wrong.
     too_high = all(motion.below_floor for motion in moved.values())
+    still = {
+        name: motion.largest
+        for name, motion in moved.items()
+        if motion.is_negligible or (motion.below_floor and not too_high)
+    }
+    reported = {f"{n!r} ({most:.2g})": n for n, most in still.items() if n not in fixed}
+    if reported:
+        message = (
+            f"never move in the {len(sample)} checked rows (at most): "
+            f"{named(list(reported))}"
+        )
+        columns = [
+            c for n in reported.values() for c in states.labels[states.slices[n]]
+        ]
+        findings.append(finding("never_moves", message, columns=columns))
     for name, motion in moved.items():
-        labels = states.labels[states.slices[name]]
-        if motion.is_negligible or (motion.below_floor and not too_high):
-            if name not in fixed:
-                message = (
-                    f"{name!r} moves in none of the {len(sample)} checked rows, or by "
-                    f"{motion.largest:.2g} at most"
-                )
-                findings.append(finding("never_moves", message, columns=labels))
+        if name in still:
             continue
+        labels = states.labels[states.slices[name]]
         if motion.share >= _ALWAYS and name not in fixed and len(sample) >= 100:
             message = f"{name!r} moves in {motion.share:.1%} of the checked rows"
             findings.append(finding("always_moves", message, columns=labels))
@@ -96,7 +106,11 @@ class _Motion:
 
     @classmethod
     def of(
-        cls, states: States, where: slice, floor: Mapping[int, float] | None
+        cls,
+        sample: Sample,
+        states: States,
+        where: slice,
+        floor: Mapping[int, float] | None,
     ) -> _Motion:
         """Measures the motion of the entity with these columns."""
         change = (states.next[:, where] - states.now[:, where]).abs()
@@ -117,10 +131,10 @@ class _Motion:
         large = (ratio > _LARGE).any(1)
         for column in varies.nonzero()[:, 0].tolist():
             median[column] = float(change[large, column].median())
-        below = bool(floor) and all(
-            float(states.now[:, where][:, c].std(correction=0)) < value
-            for c, value in (floor or {}).items()
-        )
+        below = bool(floor)
+        for column, value in (floor or {}).items():
+            extent = _extent(sample.piece, states.now[:, where.start + column])
+            below &= max(extent, float(most[column])) < _LEAVES * value
         return cls(
             largest=float(most.max()),
             is_negligible=is_negligible,
@@ -136,6 +150,15 @@ def _large(change: torch.Tensor) -> torch.Tensor:
     rank = max(1, math.ceil(0.999 * len(change)))
     value = change.kthvalue(rank).values
     return value if bool(value > 0) else change.amax()
+
+
+def _extent(piece: torch.Tensor, values: torch.Tensor) -> float:
+    """Returns the largest range of a column ``[n]`` in one trajectory."""
+    count = int(piece[-1]) + 1
+    low = values.new_full((count,), torch.inf).scatter_reduce(0, piece, values, "amin")
+    high = values.new_full((count,), -torch.inf)
+    high = high.scatter_reduce(0, piece, values, "amax")
+    return float((high - low).max())
 
 
 def _check_floor(name: str, motion: _Motion) -> list[Finding]:
