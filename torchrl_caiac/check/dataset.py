@@ -299,7 +299,8 @@ class _Check:
         if states.after is not None:
             links = self._check_succession(sample, states, index)
             hidden = {found.code for found in links.findings}
-            self._check_flags(states, index, links)
+            if not bool(padded.any()):  # flags are set before the padding
+                self._check_flags(states, index, links)
             if not hidden & _MISLEADING:
                 moving = ~links.broken
                 chosen = (sample.keep(moving), states.keep(moving))

@@ -84,8 +84,8 @@ def check_entries(
     findings = []
     for key in layout.in_keys:
         both = [key, layout.next(key)] if read_next else [key]
-        bad = [_check_state(data, layout, k) for k in both]
-        found = [f for f in bad if f is not None]
+        bad = (_check_state(data, layout, k) for k in both)
+        found = [f for f in bad if f is not None][:1]
         findings += found
         if read_next and not found:
             findings += _check_pair(data, layout, key)

@@ -16,7 +16,7 @@ from torchrl_caiac.check.values import named
 
 __all__ = ["check_jumps", "check_motion"]
 
-_ALWAYS = 0.999  # of the rows
+_ALWAYS = 0.99  # of the rows
 _REST = 0.01  # of a large change: smaller ones do not count as motion
 _LARGE = 0.1  # of a large change: the rows in which the entity moves for sure
 _NEGLIGIBLE = 1e-5  # of the largest deviation of a column: the jitter of a simulator

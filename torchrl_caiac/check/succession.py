@@ -16,6 +16,7 @@ __all__ = ["Succession", "check_succession", "locate"]
 
 _NOISY = 0.05  # fewer exact next states than this: sensors with noise
 _RELATED = 0.5  # of the distance between rows of a trajectory
+_PROBE = 2_000  # rows that tell whether next states are those of other rows
 
 
 class Succession(NamedTuple):
@@ -178,9 +179,13 @@ def _check_inside(
     """Finds wrong next states in other rows than the last of trajectories."""
     broken = torch.zeros(len(sample), dtype=torch.bool)
     moving = ~states.close(states.now, there, states.now, here)
-    wrong, is_noisy = ~exact, False
+    wrong, is_noisy, shift = ~exact, False, 0
     if bool(moving.any()) and float(exact[moving].double().mean()) < _NOISY:
-        wrong, is_noisy = _far(sample, states, here, there), True
+        probe = here[moving][:: max(1, int(moving.sum()) // _PROBE)]
+        found = locate(states, states.next[probe], states.now) >= 0
+        if float(found.double().mean()) < _RELATED:
+            wrong, shift = _far(sample, states, here, there)
+            is_noisy = not shift
     findings = []
     if time is not None:
         found, explained = _check_time(sample, here, there, wrong, time)
@@ -188,7 +193,10 @@ def _check_inside(
         broken[here[wrong & explained]] = True
         wrong = wrong & ~explained
     rows = here[wrong]
-    found_at = locate(states, states.next[rows], states.now)
+    if shift:
+        found_at = (rows + shift).clamp(0, len(sample) - 1)
+    else:
+        found_at = locate(states, states.next[rows], states.now)
     alone = _independent(sample, here, rows, found_at, is_noisy)
     if bool(alone.any()):
         message = (
@@ -208,16 +216,37 @@ def _check_inside(
 
 def _far(
     sample: Sample, states: States, here: torch.Tensor, there: torch.Tensor
-) -> torch.Tensor:
-    """Returns which pairs do not follow each other, up to the noise of sensors."""
+) -> tuple[torch.Tensor, int]:
+    """Finds pairs that do not follow each other, in data with the noise of sensors.
+
+    Args:
+        sample (Sample): the rows.
+        states (States): their states and next states.
+        here (torch.Tensor): rows of the sample, ``[p]``.
+        there (torch.Tensor): the rows that should follow, ``[p]``.
+
+    Returns:
+        tuple: which pairs do not, bool ``[p]``, and by how many rows all next states
+        are shifted, 0 if they are not.
+    """
     near = states.distance(states.next, here, states.now, there)
+    for shift in (-1, 2):
+        inside = (here + shift >= 0) & (here + shift < len(sample))
+        inside[inside.clone()] = (
+            sample.piece[here[inside] + shift] == sample.piece[here[inside]]
+        )
+        if bool(inside.any()):
+            rows = here[inside]
+            other = states.distance(states.next, rows, states.now, rows + shift)
+            if float(other.median()) < _RELATED * float(near.median()):
+                return torch.ones_like(here, dtype=torch.bool), shift
     size = torch.bincount(sample.piece)[sample.piece[here]]
-    first = here - sample.place[here]
-    other = first + (sample.place[here] + size // 2) % size
+    first = torch.searchsorted(sample.piece, sample.piece[here])
+    other = first + (here - first + size // 2) % size
     usual = states.distance(states.next, here, states.now, other)
     if float(near.median()) >= _RELATED * float(usual.median()):
-        return torch.ones_like(here, dtype=torch.bool)
-    return (near > 10 * near.median()) & (near > _RELATED * usual.median())
+        return torch.ones_like(here, dtype=torch.bool), 0
+    return (near > 10 * near.median()) & (near > _RELATED * usual.median()), 0
 
 
 def _check_time(
