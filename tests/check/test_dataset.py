@@ -466,3 +466,187 @@ def test_columns_that_mix_entities() -> None:
     data = clean()
     own_relative(data)
     assert codes(data) == ["always_moves", "mixed_columns"]
+
+
+# --- other sources, layouts and options ----------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["rows reversed", "next skips", "ids merged"])
+def test_errors_are_found_despite_noise(name: str) -> None:
+    data = clean(length=60)
+    noisy(data)
+    change, code, _ = PLANTED[name]
+    result = change(data)
+    data = result if isinstance(result, TensorDict) else data
+    data = data.exclude("achieved_goal", ("next", "achieved_goal"))
+    assert code in codes(data)
+
+
+@pytest.mark.parametrize("name", ["rows shuffled", "rows reversed"])
+def test_time_tells_the_order_of_noisy_rows(name: str) -> None:
+    data = clean()
+    noisy(data)
+    add_time(data)
+    data = PLANTED[name][0](data.exclude("achieved_goal", ("next", "achieved_goal")))
+    assert codes(data) == ["rows_out_of_order"]
+
+
+def test_transitions_that_share_an_id_but_do_not_follow_each_other() -> None:
+    data = single_rows(clean())
+    keep = torch.arange(0, len(data), 3)  # their neighbours in time are not there
+    data = reorder(clean(), keep)
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
+    data = reorder(data, order).exclude(DONE)
+    data["episode"] = torch.arange(len(data)) // 20
+    report = check_dataset(data, LAYOUT)
+    assert [f.code for f in report.findings] == ["next_unrelated"]
+    assert report.ok
+
+
+def test_without_ids_breaks_are_ends_without_flags() -> None:
+    data = clean()
+    set_flags(data, slice(None), False)
+    report = check_dataset(data, LAYOUT, trajectory_key=None)
+    assert [f.code for f in report.errors] == ["ends_never_set"]
+    assert report.findings[0].rows[:2] == (LENGTH - 1, 2 * LENGTH - 1)
+    single = check_dataset(data[:LENGTH], LAYOUT, trajectory_key=None)
+    assert single.ok and single.findings[0].code == "ends_never_set"
+    del data["next", "done"]
+    assert codes(data, trajectory_key=None) == ["ends_missing"]
+
+
+def test_full_rings_and_later_writes() -> None:
+    data = clean()
+    rb = ReplayBuffer(storage=LazyTensorStorage(500), batch_size=1)
+    for start in range(0, len(data), 50):
+        rb.extend(data[start : start + 50])
+    assert codes(rb, action_spec=(-1, 1)) == []
+
+
+def test_names_of_columns_rows_and_keys() -> None:
+    data, layout = nested(clean())
+    data["state", "left"][31, 1] = float("nan")
+    data["next", "state", "robot", "move"][40, 0] = float("inf")
+    first, second = check_dataset(data, layout).errors
+    assert first.columns == ("left (feature 1)",) and first.rows == (31,)
+    assert second.columns == ("robot (feature 0)",) and second.rows == (40,)
+    flat = clean()
+    flat["observation"][31, 5] = float("nan")
+    found = check_dataset(flat, LAYOUT).errors[0]
+    assert found.columns == ("left (column 5)",) and found.key == "observation"
+    assert "'observation' is nan in row 31, left (column 5)" in found.message
+
+
+@pytest.mark.parametrize(
+    ("floor", "expected"),
+    [
+        (1e-3, []),
+        ({"robot": 1e-3, "left": 1e-3, "right": [1e-3, 1e-3, 1e-3]}, []),
+        (1.0, ["floor_too_high"] * 3),
+        (1e-6, ["floor_too_low"] * 3),
+        ({"robot": 1e-3, "left": 1e-6, "right": 1e-3}, ["floor_too_low"]),
+    ],
+)
+def test_variance_floors_in_other_units(floor: Any, expected: list[str]) -> None:
+    assert codes(clean(), variance_floor=floor) == expected
+
+
+def test_bounds_of_actions() -> None:
+    data = clean()
+    low, high = torch.full((2,), -1.0), torch.tensor([1.0, 0.5])
+    for spec in ((low, high), Bounded(low, high, shape=(2,))):
+        found = check_dataset(data, LAYOUT, action_spec=spec).errors[0]
+        assert found.code == "action_out_of_bounds" and found.columns == ("column 1",)
+    assert codes(data, action_spec=Bounded(-1, 1, shape=(2,))) == []
+    assert codes(data.exclude("action"), action_key=None) == []
+
+
+def test_next_states_that_nothing_reads() -> None:
+    data = clean().exclude(NEXT, ("next", "achieved_goal"))
+    assert codes(data, read_next=False) == []
+
+
+def test_a_column_that_follows_the_robot_alone_is_not_stale() -> None:
+    data = clean()
+    widen(data, lambda x: 2 * x[:, 0:1])
+    assert codes(data) == []
+
+
+def test_wrong_arguments_are_named() -> None:
+    data = clean()
+    with pytest.raises(TypeError, match="layout must be an EntityLayout, got dict"):
+        check_dataset(data, {})  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="data must be a TensorDict or a ReplayBuffer"):
+        check_dataset([data], LAYOUT)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="max_rows must be an int of at least 1"):
+        check_dataset(data, LAYOUT, max_rows=0)
+    with pytest.raises(ValueError, match="at least one transition"):
+        check_dataset(data[:0], LAYOUT)
+    with pytest.raises(TypeError, match="action_spec must be a torchrl Bounded"):
+        check_dataset(data, LAYOUT, action_spec="box")
+    with pytest.raises(ValueError, match="bounds of action_spec must be ordered"):
+        check_dataset(data, LAYOUT, action_spec=(1, -1))
+    with pytest.raises(ValueError, match="variance_floor names"):
+        check_dataset(data, LAYOUT, variance_floor={"cup": 1.0})
+
+
+def test_all_ends_with_automatic_resets_are_counted() -> None:
+    data = clean()
+    over_end(data)
+    found = check_dataset(data, LAYOUT).errors[0]
+    assert found.count == len(data) // LENGTH and found.rows[:2] == (29, 59)
+
+
+# --- before fitting ------------------------------------------------------------------
+
+SILENT = ["next shuffled", "next over ends", "next zero", "next is state"]
+SILENT += ["next skips", "rows shuffled", "same actions"]
+
+
+@pytest.mark.parametrize("name", SILENT)
+def test_fitting_stops_before_it_learns_from_errors(name: str) -> None:
+    change, code, _ = PLANTED[name]
+    data = clean()
+    result = change(data)
+    data = result if isinstance(result, TensorDict) else data
+    model = GaussianWorldModel(LAYOUT, 2, (8,))
+    options: Any = {"steps": 2, "batch_size": 8, "progress": False}
+    with pytest.raises(DatasetError, match=code) as caught:
+        fit_world_model(model, data, **options)
+    assert not model.fitted
+    assert caught.value.report.errors[0].code == code
+    fit_world_model(model, data, **options, check=False)
+    assert model.fitted
+
+
+def test_warnings_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    columns = {"robot": range(4), "left": range(4, 7), "right": range(7, 9)}
+    layout = EntityLayout(columns, fixed=["robot", "right"])
+    data = clean().exclude("achieved_goal", ("next", "achieved_goal"))
+    widen(data, relative)
+    with caplog.at_level(logging.WARNING, "torchrl_caiac.check"):
+        check_before_use(data, layout)
+        assert [r.getMessage().split(":")[0] for r in caplog.records] == [
+            "stale_columns"
+        ]
+        check_before_use(data, layout)
+        assert len(caplog.records) == 1
+
+
+# --- this package's own data ---------------------------------------------------------
+
+
+def test_episodes_of_fetch_push_have_no_findings(tmp_path: Path) -> None:
+    from torchrl_caiac.data import load_minari
+    from torchrl_caiac.envs import create_fetch_push_expert, fetch_push_layout
+
+    dataset = create_fetch_push_expert(
+        episodes=4, steps=60, root=tmp_path, workers=1, seed=3, progress=False
+    )
+    data = load_minari(dataset, tmp_path / "rows", progress=False)
+    layout = fetch_push_layout(2)
+    report = check_dataset(data, layout, action_spec=(-1, 1), variance_floor=1e-3)
+    assert not report.errors
+    assert {f.code for f in report.warnings} <= {"never_moves"}
+    at_ends(data := data.clone(), 0)
+    assert [f.code for f in check_dataset(data, layout).errors] == ["next_zero_at_ends"]

@@ -430,7 +430,7 @@ def _rows(data: TensorDictBase | ReplayBuffer) -> tuple[TensorDictBase, int]:
         raise TypeError(
             f"data must be a TensorDict or a ReplayBuffer, got {type(data).__name__}"
         )
-    if rows.batch_dims < 1 or not rows.numel():
+    if rows.batch_dims < 1 or not rows.batch_size.numel():
         raise ValueError(
             f"the data have the batch size {list(rows.batch_size)}, expected at least "
             "one transition [T]"
@@ -445,7 +445,7 @@ def _bounds(spec: Any) -> tuple[torch.Tensor, torch.Tensor] | None:
         return None
     pair = spec
     if not isinstance(spec, (tuple, list)):
-        space = getattr(spec, "space", None)
+        space: Any = getattr(spec, "space", None)
         if not hasattr(space, "low") or not hasattr(space, "high"):
             raise TypeError(
                 f"action_spec must be a torchrl Bounded spec or a pair of bounds, got "

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
@@ -178,8 +175,7 @@ def _check_goals(
         return []  # goals are drawn from later states
     if not layout.is_flat:
         # Data without desired goals are complete: goals come from later states.
-        wanted: Sequence[Any] = layout.goal.values()
-        wanted = [k for k in wanted if k is not None]
+        wanted = [key for key in layout.goal.values() if key is not None]
         if any(k in present for k in wanted):
             findings += [
                 _missing(data, k, "the goal") for k in wanted if k not in present

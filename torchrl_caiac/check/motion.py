@@ -113,7 +113,7 @@ class _Motion:
         floor: Mapping[int, float] | None,
     ) -> _Motion:
         """Measures the motion of the entity with these columns."""
-        change = (states.next[:, where] - states.now[:, where]).abs()
+        change = (states.next[:, where] - states.now[:, where]).abs().float()
         most = change.amax(0)
         tiny = _NEGLIGIBLE * states.scale.max()
         is_negligible = bool((most <= states.rounding[where].clamp_min(tiny)).all())

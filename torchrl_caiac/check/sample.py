@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -13,6 +13,7 @@ from torchrl_caiac.trajectories import TrajectoryIndex
 
 __all__ = ["Sample", "take_sample"]
 
+_CHUNK = 16_384  # rows that are read at once
 _PIECE = 1000  # rows of a trajectory that are kept together
 
 
@@ -39,6 +40,8 @@ class Sample:
 
     def keep(self, mask: torch.Tensor) -> Sample:
         """Returns the sample without the rows where ``mask`` ``[n]`` is false."""
+        if bool(mask.all()):
+            return self
         return replace(
             self,
             rows=self.rows[mask],
@@ -59,17 +62,25 @@ class Sample:
         leaf = self.data.get(key).as_subclass(torch.Tensor)
         return leaf[self.rows.to(leaf.device)].cpu()
 
-    def read(self, key: NestedKey, columns: Any = None) -> torch.Tensor:
+    def read(
+        self, key: NestedKey, columns: Sequence[int] | None = None
+    ) -> torch.Tensor:
         """Returns an entry of the rows as floating-point numbers, ``[n, W]``.
 
         Integers and booleans become float64, smaller floating-point types float32.
         """
-        values = self.raw(key)
-        values = values.reshape(len(values), values[0:1].numel() if len(values) else 0)
-        if columns is not None:
-            values = values[:, columns]
-        wide = values.dtype == torch.float64 or not values.is_floating_point()
-        return values.to(torch.float64 if wide else torch.float32)
+        leaf = self.data.get(key).as_subclass(torch.Tensor)
+        wide = leaf.dtype == torch.float64 or not leaf.is_floating_point()
+        width = leaf[:1].numel() if columns is None else len(columns)
+        dtype = torch.float64 if wide else torch.float32
+        values = torch.empty(len(self), width, dtype=dtype)
+        for start in range(0, len(self), _CHUNK):  # no second copy of a large entry
+            rows = self.rows[start : start + _CHUNK]
+            part = leaf[rows.to(leaf.device)].reshape(len(rows), -1)
+            values[start : start + _CHUNK] = (
+                part if columns is None else part[:, columns]
+            )
+        return values
 
     def following(self, steps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns pairs of a row and the row ``steps`` later in the same piece.

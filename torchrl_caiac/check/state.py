@@ -53,6 +53,8 @@ class States:
 
     def keep(self, mask: torch.Tensor) -> States:
         """Returns the states without the rows where ``mask`` ``[n]`` is false."""
+        if bool(mask.all()):
+            return self  # no second copy of the largest tensors
         after = None if self.after is None else self.after[mask]
         return _with_scales(replace(self, now=self.now[mask], after=after))
 
@@ -161,9 +163,10 @@ def _with_scales(states: States) -> States:
         return states
     # Column by column: a whole copy in float64 would double the memory.
     scale = [float(x.double().std(correction=0)) for x in now.unbind(1)]
-    size = now.abs().amax(0)
+    size = torch.maximum(now.amax(0), -now.amin(0))
     if states.after is not None:
-        size = torch.maximum(size, states.after.abs().amax(0))
+        after = states.after
+        size = torch.maximum(size, torch.maximum(after.amax(0), -after.amin(0)))
     return replace(
         states,
         scale=torch.tensor(scale, dtype=now.dtype),

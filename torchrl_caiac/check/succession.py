@@ -16,6 +16,7 @@ __all__ = ["Succession", "check_succession", "locate"]
 
 _NOISY = 0.05  # fewer exact next states than this: sensors with noise
 _RELATED = 0.5  # of the distance between rows of a trajectory
+_RESETS = 0.2  # of the trajectories: their ends jump further than most steps
 _PROBE = 2_000  # rows that tell whether next states are those of other rows
 
 
@@ -152,10 +153,13 @@ def _check_ends(
     if len(ends) and len(moves) >= 10:
         usual = states.distance(states.next, moves, states.now, moves)
         change = states.distance(states.next, ends, states.now, ends)
-        # A long trajectory may be stored in pieces: only a jump shows a reset.
-        jumps = change > 2 * torch.quantile(usual[:1_000_000], 0.99)
-        ends = ends[jumps]
-        over[ends] = locate(states, states.next[ends], starts) >= 0
+        found = locate(states, states.next[ends], starts) >= 0
+        ends, change = ends[found], change[found]
+        # A long trajectory may be stored in pieces: only jumps show that it was reset.
+        large = torch.quantile(usual[:1_000_000], 0.99)
+        jumps = (change > large).double()
+        if len(ends) and bool((change > 2 * large).any()) and jumps.mean() > _RESETS:
+            over[ends] = True
     if bool(over.any()):
         message = (
             f"in {int(over.sum())} last rows of trajectories {next_key!r} is the first "
@@ -186,10 +190,10 @@ def _check_inside(
         if float(found.double().mean()) < _RELATED:
             wrong, shift = _far(sample, states, here, there)
             is_noisy = not shift
-    findings = []
+    findings: list[Finding] = []
     if time is not None:
-        found, explained = _check_time(sample, here, there, wrong, time)
-        findings += found
+        by_time, explained = _check_time(sample, here, there, wrong, time)
+        findings += by_time
         broken[here[wrong & explained]] = True
         wrong = wrong & ~explained
     rows = here[wrong]
