@@ -25,6 +25,7 @@ LAYERS = [
     {"checkpoint", "data"},
     {"envs"},
     {"modules"},
+    {"check"},
     {"objectives"},
     {"fit"},
     {"influence"},

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from torchrl_caiac.check import check_dataset
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms import CAIACTransform, CoDATransform
 
-__all__ = ["CAIACTransform", "CoDATransform", "EntityLayout"]
+__all__ = ["CAIACTransform", "CoDATransform", "EntityLayout", "check_dataset"]
 
 __version__ = "0.1.0"

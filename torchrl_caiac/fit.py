@@ -16,6 +16,7 @@ from tensordict.utils import NestedKey
 from tqdm.auto import tqdm
 
 from torchrl_caiac._keys import as_key, get_leaf, jsonable
+from torchrl_caiac.check import check_before_use
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 from torchrl_caiac.trajectories import trajectory_index
@@ -44,6 +45,7 @@ def fit_world_model(
     max_memory: int = 2**30,
     flush_denormal: bool = True,
     progress: bool = True,
+    check: bool = True,
 ) -> TensorDict:
     """Fits a world model by maximum likelihood (paper, A.7).
 
@@ -87,6 +89,9 @@ def fit_world_model(
         flush_denormal (bool): whether to treat denormal numbers as zero during the
             call, which can halve the time of a step on a CPU. Defaults to ``True``.
         progress (bool): whether to show a progress bar. Defaults to ``True``.
+        check (bool): whether to check a sample of the data first, see
+            :func:`~torchrl_caiac.check.check_dataset`. Warnings are logged. Defaults
+            to ``True``.
 
     Returns:
         TensorDict: one row for each validation, ``[E]``: ``"step"``; ``"train_nll"``,
@@ -100,6 +105,7 @@ def fit_world_model(
             infinite values, do not fit the model, or have fewer than two trajectories;
             the checkpoint is truncated, or was made with other settings or data.
         RuntimeError: the loss is not finite.
+        DatasetError: the check found errors.
 
     Examples:
         >>> import torch
@@ -149,6 +155,8 @@ def fit_world_model(
         max_validation_rows,
         generator,
     )
+    if check:
+        _check(model, sources, key)
     fit = _Fit(model, lr, generator)
     keeper: TrainingCheckpoint | None = None
     if checkpoint is not None:
@@ -211,6 +219,26 @@ def fit_world_model(
     model.load_state_dict(fit.best)
     model.eval()
     return fit.table()
+
+
+def _check(
+    model: EntityDynamicsModel, sources: Sequence[TensorDictBase], key: NestedKey
+) -> None:
+    config = model.config
+    for td in sources:
+        if len(td):
+            check_before_use(
+                td,
+                model.layout,
+                action_key=model.action_key,
+                reward_key=None,
+                trajectory_key=key,
+                # The floor of absolute targets is not that of changes.
+                variance_floor=config["variance_floor"]
+                if model.target == "change"
+                else None,
+                predict=config["predict"],
+            )
 
 
 class _Rows:
