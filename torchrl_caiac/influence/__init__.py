@@ -13,6 +13,7 @@ from torchrl_caiac.influence.metrics import (
 )
 from torchrl_caiac.influence.mixture_divergence import causal_action_influence
 from torchrl_caiac.influence.score_buffer import score_buffer
+from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,
@@ -26,6 +27,7 @@ __all__ = [
     "AttentionInfluence",
     "DistanceInfluence",
     "EntityReport",
+    "ScoreOnWrite",
     "SimulatorInfluence",
     "TrueInfluence",
     "best_threshold",

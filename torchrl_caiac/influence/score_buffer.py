@@ -14,7 +14,7 @@ from torchrl.data import ReplayBuffer, TensorStorage
 from tqdm.auto import tqdm
 
 from torchrl_caiac._files import claim_folder
-from torchrl_caiac._keys import as_key, jsonable
+from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import (
     add_revision,
     drop_prefetched,
@@ -32,14 +32,13 @@ from torchrl_caiac.influence.score_leaf import (
     row_states,
 )
 from torchrl_caiac.influence.score_record import (
-    estimator_digest,
-    layout_digest,
     read_record,
+    score_settings,
     settings_digest,
     settings_that_differ,
     write_record,
 )
-from torchrl_caiac.influence.scorer import Scorer
+from torchrl_caiac.influence.scorer import Scorer, layout_of
 from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
 __all__ = ["score_buffer"]
@@ -201,16 +200,16 @@ def score_buffer(
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     key, storage = as_key(key), rb.storage
     known_to_be_memmap(storage_data(storage))
-    layout = _layout_of(estimator)
-    settings = {
-        "estimator": estimator_digest(estimator),
-        "layout": layout_digest(layout),
-        "smoothing": smoothing,
-        "lookahead": lookahead,
-        "every": every,
-        "trajectory_key": jsonable(trajectory_key),
-        "done_key": jsonable(done_key),
-    }
+    layout = layout_of(estimator)
+    settings = score_settings(
+        estimator,
+        layout,
+        smoothing=smoothing,
+        lookahead=lookahead,
+        every=every,
+        trajectory_key=trajectory_key,
+        done_key=done_key,
+    )
     is_prepared = False
     for number in range(_MOST_PASSES):
         index = trajectory_index(rb, trajectory_key=trajectory_key, done_key=done_key)
@@ -461,18 +460,6 @@ def _claimed(data: TensorDictBase) -> AbstractContextManager[None]:
     """Locks the folder of memory-mapped data, so that one process scores it."""
     folder = memmap_folder(data) if data.is_memmap() else None
     return nullcontext() if folder is None else claim_folder(folder)
-
-
-def _layout_of(estimator: Any) -> EntityLayout:
-    layout = getattr(estimator, "layout", None)
-    if layout is None:
-        layout = getattr(getattr(estimator, "model", None), "layout", None)
-    if not isinstance(layout, EntityLayout):
-        raise TypeError(
-            f"the estimator, a {type(estimator).__name__}, has no `layout`: give it "
-            "the EntityLayout that its scores follow"
-        )
-    return layout
 
 
 def _check_int(name: str, value: int, least: int) -> None:

@@ -23,6 +23,7 @@ __all__ = [
     "layout_digest",
     "read_record",
     "score_file",
+    "score_settings",
     "settings_digest",
     "settings_that_differ",
     "write_record",
@@ -155,6 +156,43 @@ def settings_that_differ(before: dict[str, Any], now: dict[str, Any]) -> str:
         for name in {**before, **now}
         if before.get(name) != now.get(name)
     )
+
+
+def score_settings(
+    estimator: Any,
+    layout: EntityLayout,
+    *,
+    smoothing: int,
+    lookahead: int,
+    every: int,
+    trajectory_key: NestedKey | None,
+    done_key: NestedKey | None,
+) -> dict[str, Any]:
+    """Returns what scores depend on, apart from the data.
+
+    Args:
+        estimator (callable): the estimator.
+        layout (EntityLayout): its entities.
+
+    Keyword Args:
+        smoothing (int): see :func:`~torchrl_caiac.influence.score_buffer`.
+        lookahead (int): the same.
+        every (int): the same.
+        trajectory_key (NestedKey, optional): the same.
+        done_key (NestedKey, optional): the same.
+
+    Returns:
+        dict: JSON-compatible settings.
+    """
+    return {
+        "estimator": estimator_digest(estimator),
+        "layout": layout_digest(layout),
+        "smoothing": smoothing,
+        "lookahead": lookahead,
+        "every": every,
+        "trajectory_key": jsonable(trajectory_key),
+        "done_key": jsonable(done_key),
+    }
 
 
 def settings_digest(settings: dict[str, Any]) -> int:

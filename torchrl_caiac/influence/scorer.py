@@ -16,7 +16,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
 from torchrl_caiac.trajectories import TrajectoryIndex
 
-__all__ = ["Scorer"]
+__all__ = ["Scorer", "layout_of", "reads_state_only", "to_device_of"]
 
 _NAMED = 8  # rows that an error names
 _SAMPLE = 4096  # states that are passed to the estimator's prepare()
@@ -84,11 +84,11 @@ class Scorer:
         is_prepared: bool = False,
     ) -> None:
         state_keys = list(layout.in_keys)
-        in_keys = getattr(estimator, "in_keys", None)
-        in_keys = [as_key(k) for k in in_keys] if in_keys else state_keys
-        reads_state_only = set(in_keys) <= set(state_keys)
+        in_keys = _in_keys(estimator, layout)
         # Whether the state after the last row of a trajectory is scored.
-        self._final = reads_state_only and (smoothing > 1 or lookahead > 0)
+        self._final = reads_state_only(estimator, layout) and (
+            smoothing > 1 or lookahead > 0
+        )
         layout.check(data[:1], next=self._final)
         self._states = _select(data, in_keys)
         self._next_states = (
@@ -108,7 +108,6 @@ class Scorer:
         self._future = (smoothing - 1) // 2
         self._lookahead = lookahead
         self._every = every
-        self._device = _device(estimator)
         self.is_prepared = is_prepared
         self._blocks: dict[int, _Block] = {}
         self.num_chunks = -(-index.length // batch_size)
@@ -284,8 +283,7 @@ class Scorer:
             count = min(length, _SAMPLE)
             rows = torch.linspace(0, length - 1, count, dtype=torch.float64).long()
             sample = self._states[rows.to(self._states.device or "cpu")]
-            if self._device is not None:
-                sample = sample.to(self._device)
+            sample = to_device_of(self._estimator, sample)
             prepare(sample, length, smoothing=self._past + self._future + 1)
         self.is_prepared = True
 
@@ -295,9 +293,7 @@ class Scorer:
         """Returns the estimator's scores of states ``[n]``, after checking them."""
         self._prepare()
         # A copy: the estimator may write into its input.
-        states = states.clone()
-        if self._device is not None:
-            states = states.to(self._device)
+        states = to_device_of(self._estimator, states.clone())
         for name, value in states.items(include_nested=True, leaves_only=True):
             if value.is_floating_point():
                 finite = value.isfinite().reshape(len(rows), -1).all(-1).cpu()
@@ -375,12 +371,45 @@ def _both(first: torch.Tensor, second: torch.Tensor | None) -> torch.Tensor:
     return first if second is None else first & second
 
 
-def _device(estimator: Any) -> torch.device | None:
-    if not isinstance(estimator, nn.Module):
-        return None
-    for tensor in (*estimator.parameters(), *estimator.buffers()):
-        return tensor.device
-    return None
+def layout_of(estimator: Any) -> EntityLayout:
+    """Returns the layout that an estimator's scores follow.
+
+    Args:
+        estimator (callable): it, or its ``model``, has a ``layout``.
+
+    Returns:
+        EntityLayout: the layout.
+
+    Raises:
+        TypeError: there is none.
+    """
+    layout = getattr(estimator, "layout", None)
+    if layout is None:
+        layout = getattr(getattr(estimator, "model", None), "layout", None)
+    if not isinstance(layout, EntityLayout):
+        raise TypeError(
+            f"the estimator, a {type(estimator).__name__}, has no `layout`: give it "
+            "the EntityLayout that its scores follow"
+        )
+    return layout
+
+
+def reads_state_only(estimator: Any, layout: EntityLayout) -> bool:
+    """Returns whether an estimator reads nothing but the state of a layout."""
+    return set(_in_keys(estimator, layout)) <= set(layout.in_keys)
+
+
+def to_device_of(estimator: Any, states: TensorDictBase) -> TensorDictBase:
+    """Returns states on the device of an estimator, if it is a module with one."""
+    if isinstance(estimator, nn.Module):
+        for tensor in (*estimator.parameters(), *estimator.buffers()):
+            return states.to(tensor.device)
+    return states
+
+
+def _in_keys(estimator: Any, layout: EntityLayout) -> list[NestedKey]:
+    in_keys = getattr(estimator, "in_keys", None)
+    return [as_key(key) for key in in_keys] if in_keys else list(layout.in_keys)
 
 
 def _some(rows: torch.Tensor) -> str:
