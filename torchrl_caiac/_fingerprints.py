@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import torch
@@ -15,6 +15,7 @@ __all__ = [
     "fingerprint",
     "fingerprint_key",
     "is_fingerprint_of",
+    "matches",
     "rows_with_fingerprints",
     "settings_of",
     "state_hash",
@@ -58,7 +59,7 @@ def state_hash(td: TensorDictBase, keys: Sequence[NestedKey]) -> torch.Tensor | 
         keys (sequence of NestedKey): their entries.
 
     Returns:
-        torch.Tensor, optional: int64 ``[B]``; ``None`` if an entry is missing.
+        torch.Tensor, optional: int64 ``[B]``; ``None`` if no entry is there.
 
     Examples:
         >>> import torch
@@ -71,26 +72,14 @@ def state_hash(td: TensorDictBase, keys: Sequence[NestedKey]) -> torch.Tensor | 
         False
     """
     total: torch.Tensor | None = None
-    number = 0
-    for key in keys:
-        value = td.get(key, None)
-        if value is None:
-            return None
-        leaves = [value]
-        if is_tensor_collection(value):
-            names = sorted(value.keys(True, True), key=path)
-            leaves = [value.get(name) for name in names]
-        for leaf in leaves:
-            if not isinstance(leaf, torch.Tensor) or not leaf.numel():
-                continue
-            lanes = _lanes(leaf.as_subclass(torch.Tensor))
-            weights = _weights(lanes.shape[1], number, lanes.device)
-            if lanes.device.type == "cpu":
-                found = torch.mv(lanes, weights)
-            else:  # integers have no matrix products on other devices
-                found = (lanes * weights).sum(-1)
-            total = found if total is None else total + found
-            number += 1
+    for number, leaf in enumerate(_leaves(td, keys)):
+        lanes = _lanes(leaf)
+        weights = _weights(lanes.shape[1], number, 1, lanes.device)
+        if lanes.device.type == "cpu":
+            found = torch.mv(lanes, weights)
+        else:  # integers have no matrix products on other devices
+            found = (lanes * weights).sum(-1)
+        total = found if total is None else total + found
     return total
 
 
@@ -120,6 +109,35 @@ def fingerprint(
         tensor([3, 3])
     """
     return _joint(state, after) + _signed((_MAGIC << 32) | (settings & 0xFFFFFFFF))
+
+
+def matches(
+    td: TensorDictBase,
+    known: torch.Tensor,
+    keys: Sequence[NestedKey],
+    next_keys: Sequence[NestedKey],
+) -> torch.Tensor:
+    """Returns which rows still have the states of their fingerprints.
+
+    Args:
+        td (TensorDictBase): the rows, ``[B]``.
+        known (torch.Tensor): their fingerprints, int64 ``[B]``.
+        keys (sequence of NestedKey): the entries of states.
+        next_keys (sequence of NestedKey): the entries of next states.
+
+    Returns:
+        torch.Tensor: bool ``[B]``.
+    """
+    left: torch.Tensor = known
+    for names, factor in ((keys, 1), (next_keys, _NEXT)):
+        for number, leaf in enumerate(_leaves(td, names)):
+            lanes = _lanes(leaf)
+            weights = _weights(lanes.shape[1], number, factor, lanes.device)
+            if lanes.device.type == "cpu":
+                left = torch.addmv(left, lanes, weights, alpha=-1)
+            else:
+                left = left - (lanes * weights).sum(-1)
+    return left >> 32 == _MAGIC
 
 
 def is_fingerprint_of(
@@ -161,10 +179,8 @@ def rows_with_fingerprints(
     found = torch.zeros(len(known), dtype=torch.bool, device=known.device)
     for start in range(0, len(known), batch_size):
         part = td[start : start + batch_size]
-        state, after = state_hash(part, keys), state_hash(part, next_keys)
-        if state is not None:
-            rows = slice(start, start + len(part))
-            found[rows] = is_fingerprint_of(known[rows], state, after)
+        rows = slice(start, start + len(part))
+        found[rows] = matches(part, known[rows], keys, next_keys)
     return found
 
 
@@ -174,18 +190,33 @@ def _joint(state: torch.Tensor, after: torch.Tensor | None) -> torch.Tensor:
     return torch.add(state, after, alpha=_signed(_NEXT))
 
 
+def _leaves(td: TensorDictBase, keys: Sequence[NestedKey]) -> Iterator[torch.Tensor]:
+    """Yields the tensors of a state, always in the same order."""
+    for key in keys:
+        value = td.get(key, None)
+        if is_tensor_collection(value):
+            names = sorted(value.keys(True, True), key=path)
+            leaves = [value.get(name) for name in names]
+        else:
+            leaves = [value]
+        for leaf in leaves:
+            if isinstance(leaf, torch.Tensor) and leaf.numel():
+                yield leaf.as_subclass(torch.Tensor)
+
+
 def _lanes(leaf: torch.Tensor) -> torch.Tensor:
     """Returns the bits of a leaf ``[B, ...]`` as int64 ``[B, L]``."""
-    flat = leaf.reshape(len(leaf), -1)
-    if flat.dtype.is_complex:
+    flat = leaf if leaf.ndim == 2 else leaf.reshape(len(leaf), -1)
+    if flat.is_complex():
         flat = torch.view_as_real(flat).flatten(1)
     if flat.is_floating_point():
+        size = flat.dtype.itemsize
         flat = flat.contiguous()
-        if flat.dtype.itemsize == 2:
+        if size == 2:
             return flat.view(torch.int16).long()
-        if flat.dtype.itemsize == 4 and flat.shape[1] % 2:
+        if size == 4 and flat.shape[1] % 2:
             flat = torch.nn.functional.pad(flat, (0, 1))
-        if flat.dtype.itemsize == 8:
+        if size == 8:
             # The upper half of a value has its leading bits. Moved to a lower half,
             # they reach more bits of the hash.
             flat = flat.view(torch.int32).roll(-1, 1)
@@ -194,7 +225,9 @@ def _lanes(leaf: torch.Tensor) -> torch.Tensor:
 
 
 @lru_cache(maxsize=256)
-def _weights(width: int, number: int, device: torch.device) -> torch.Tensor:
+def _weights(
+    width: int, number: int, factor: int, device: torch.device
+) -> torch.Tensor:
     """Returns odd random weights of the lanes of a leaf, int64 ``[width]``."""
     found = []
     seed = (number + 1) * 0xD1B54A32D192ED03 & _MASK
@@ -202,7 +235,8 @@ def _weights(width: int, number: int, device: torch.device) -> torch.Tensor:
         seed = (seed + _NEXT) & _MASK
         mixed = ((seed ^ (seed >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
         mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) & _MASK
-        found.append(_signed((mixed ^ (mixed >> 31)) | 1))
+        weight = (mixed ^ (mixed >> 31)) | 1
+        found.append(_signed(weight * factor & _MASK))
     return torch.tensor(found, dtype=torch.int64, device=device)
 
 

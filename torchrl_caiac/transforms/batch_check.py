@@ -10,7 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._fingerprints import fingerprint_key, is_fingerprint_of, state_hash
+from torchrl_caiac._fingerprints import (
+    fingerprint_key,
+    is_fingerprint_of,
+    matches,
+    state_hash,
+)
 from torchrl_caiac._keys import missing_key
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY
@@ -96,17 +101,18 @@ class BatchCheck:
                 rows of a window do not follow each other.
         """
         known = td.get(self._fingerprint_key, None)
-        state = after = is_valid = None
-        if known is not None or self.window > 1:
+        is_valid = crosses = None
+        if self.window == 1:
+            if known is not None:
+                is_valid = matches(td, known, self.layout.in_keys, self._next_keys)
+        else:
             state = state_hash(td, self.layout.in_keys)
             after = state_hash(td, self._next_keys)
-        if known is not None and state is not None:
-            is_valid = is_fingerprint_of(known, state, after)
-        crosses = None
-        if self.window > 1:
             crosses = self._crossings(td)
             if state is not None and after is not None:
                 crosses = crosses | self._gaps(td, state, after)
+                if known is not None:
+                    is_valid = is_fingerprint_of(known, state, after)
         if not LateCheck.needed(scores.device) and crosses is not None:
             if bool(crosses.any()):
                 self._explain_windows(td, crosses)
@@ -116,10 +122,12 @@ class BatchCheck:
         if LateCheck.needed(scores.device):
             is_wrong = None if is_valid is None else ~is_valid.all()
             return CheckedScores(scores, None, is_wrong, crosses)
-        # A sum is finite if all its terms are.
-        if not math.isfinite(scores.sum().item()):
+        if is_valid is None:
+            # A sum is finite if all its terms are.
+            if not math.isfinite(scores.sum().item()):
+                self._explain_scores(scores)
+        elif not bool(is_valid.all()):  # score_buffer has checked its scores
             self._explain_scores(scores)
-        if is_valid is not None and not bool(is_valid.all()):
             self._explain_fingerprints(is_valid)
         return CheckedScores(scores, None, None, None)
 

@@ -149,11 +149,16 @@ def components(
 
 
 def _shared(
-    masks: torch.Tensor, swap_prob: float, generator: torch.Generator | None
+    masks: torch.Tensor,
+    swap_prob: float,
+    chosen: torch.Tensor | None,
+    generator: torch.Generator | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Draws what a component shares: leader, random number, whether it is chosen."""
     leader, device = _leader(masks), masks.device
     is_chosen = masks != 0
+    if chosen is not None:
+        is_chosen = is_chosen & chosen.unsqueeze(-1)
     if swap_prob < 1.0:
         chance = draw_numbers(
             torch.rand, masks.shape, device=device, generator=generator
@@ -165,29 +170,28 @@ def _shared(
 
 def draw_batch_components(
     masks: torch.Tensor,
-    num_counterfactual: int,
+    num_windows: int,
     *,
     window: int = 1,
     swap_prob: float = 1.0,
-    windows: torch.Tensor | None = None,
+    chosen: torch.Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> SwapDraw:
     """Draws donors among the windows of the batch itself.
 
-    Each component of each counterfactual window draws one of the *other* windows that
+    Each component of each chosen window draws one of the *other* windows that
     have the same component, all with the same probability and independently of the
     other components.
 
     Args:
         masks (torch.Tensor): int64 ``[B, N]``, of :func:`components`.
-        num_counterfactual (int): the number of windows that become counterfactual,
-            ``C``.
+        num_windows (int): the number of windows that are drawn for, ``C``.
 
     Keyword Args:
         window (int): rows in a window. Defaults to 1.
         swap_prob (float): probability of swapping a component. Defaults to 1.
-        windows (torch.Tensor, optional): int64 ``[C]``, the windows that become
-            counterfactual. Defaults to the last ones.
+        chosen (torch.Tensor, optional): bool ``[C]``, which of these windows become
+            counterfactual. Defaults to all of them.
         generator (torch.Generator, optional): source of randomness.
 
     Returns:
@@ -203,24 +207,23 @@ def draw_batch_components(
         (tensor([[0, 0, 1]]), tensor([[True, True, True]]))
     """
     count, entities = masks.shape
-    first = count - num_counterfactual
-    tail = masks[first:] if windows is None else masks.index_select(0, windows)
-    leader, pick, is_chosen = _shared(tail, swap_prob, generator)
+    first = count - num_windows
+    tail = masks[first:]
+    leader, pick, is_chosen = _shared(tail, swap_prob, chosen, generator)
     # Sorted, the windows of each component are consecutive, each once, by its leader.
     keys, order = torch.where(_leads(masks), masks, 0).flatten().sort(stable=True)
     places = torch.arange(order.shape[0], device=masks.device)
     place = torch.empty_like(order).scatter_(0, order, places)
     begin = torch.searchsorted(keys, tail)
     others = torch.searchsorted(keys, tail, right=True) - begin - 1
-    chosen = begin + pick % others.clamp_min(1)
+    pick = begin + pick % others.clamp_min(1)
     # A window is among those of its own component: skip it.
-    own = place.view(count, entities)
-    own = own[first:] if windows is None else own.index_select(0, windows)
-    chosen += chosen >= own.gather(1, leader)
-    donors = pick_rows(order, chosen.clamp_max(order.shape[0] - 1)) // entities
+    place = place.view(count, entities)[first:]
+    pick += pick >= place.gather(1, leader)
+    donors = pick_rows(order, pick.clamp_max(order.shape[0] - 1)) // entities
     swapped = is_chosen & (others > 0)
     no_donor = (is_chosen ^ swapped).sum(0)
-    return SwapDraw(donors * window, swapped, no_donor, windows=windows)
+    return SwapDraw(donors * window, swapped, no_donor, chosen=chosen)
 
 
 def draw_buffer_components(
@@ -228,6 +231,7 @@ def draw_buffer_components(
     index: ComponentIndex,
     *,
     swap_prob: float = 1.0,
+    chosen: torch.Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> SwapDraw:
     """Draws donors among the windows of a donor storage that have the same component.
@@ -238,6 +242,8 @@ def draw_buffer_components(
 
     Keyword Args:
         swap_prob (float): probability of swapping a component. Defaults to 1.
+        chosen (torch.Tensor, optional): bool ``[C]``, which of these windows become
+            counterfactual. Defaults to all of them.
         generator (torch.Generator, optional): source of randomness.
 
     Returns:
@@ -256,15 +262,15 @@ def draw_buffer_components(
         tensor([7, 7])
     """
     device, home = masks.device, index.masks.device
-    _, pick, is_chosen = _shared(masks, swap_prob, generator)
+    _, pick, is_chosen = _shared(masks, swap_prob, chosen, generator)
     place = torch.searchsorted(index.masks, masks.to(home))
     place = place.clamp_max(index.masks.shape[0] - 1)
     found = (pick_rows(index.masks, place) == masks.to(home)).to(device)
     size, offset = pick_rows(index.size, place), pick_rows(index.offset, place)
-    chosen = pick.to(home) % size.clamp_min(1) + offset
-    donors = pick_rows(index.starts, chosen).to(device, torch.int64)
+    pick = pick.to(home) % size.clamp_min(1) + offset
+    donors = pick_rows(index.starts, pick).to(device, torch.int64)
     swapped = is_chosen & found
-    return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0))
+    return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0), chosen=chosen)
 
 
 # --- what may be drawn from a storage ------------------------------------------------
@@ -378,6 +384,7 @@ class ComponentDonors(BufferDonors):
         free: torch.Tensor,
         *,
         swap_prob: float = 1.0,
+        chosen: torch.Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> SwapDraw:
         """Draws donors, and the goals of donor windows.
@@ -387,13 +394,17 @@ class ComponentDonors(BufferDonors):
 
         Keyword Args:
             swap_prob (float): probability of swapping a component. Defaults to 1.
+            chosen (torch.Tensor, optional): bool ``[C]``, which of these windows become
+                counterfactual. Defaults to all of them.
             generator (torch.Generator, optional): source of randomness.
 
         Returns:
             SwapDraw: donors and goals as rows of the donor storage, the same for all
             entities of a component.
         """
-        draw = super().draw(free, swap_prob=swap_prob, generator=generator)
+        draw = super().draw(
+            free, swap_prob=swap_prob, chosen=chosen, generator=generator
+        )
         if draw.goal_rows is None:
             return draw
         leader = _leader(free).to(draw.goal_rows.device)

@@ -29,7 +29,6 @@ from torchrl_caiac.transforms.checks import (
 from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
 from torchrl_caiac.transforms.goals.window import WindowGoal
-from torchrl_caiac.transforms.indexing import window_rows
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import RewardFn, recompute_reward
 from torchrl_caiac.transforms.swap import SwapPlan, SwapPlanner, apply_swap
@@ -270,29 +269,29 @@ class CounterfactualTransform(BufferTransform, ABC):
                 the transform's own.
 
         Returns:
-            SwapDraw: the draw, for ``C`` windows.
+            SwapDraw: the draw, for the last ``C`` windows.
         """
         generator = self.generator if generator is None else generator
         free = self.swappable(scores)
         total = free.shape[0]
         count = self.num_counterfactual(total)
-        windows = None
+        chosen = None
         if self.chosen_rows == "random" and 0 < count < total:
-            windows = draw_windows(
-                total, count, device=free.device, generator=generator
-            )
+            chosen = draw_windows(total, count, device=free.device, generator=generator)
+            count = total
         if self._donors:
-            chosen = free[total - count :] if windows is None else free[windows]
-            draw = self._donors[0].draw(
-                chosen, swap_prob=self.swap_prob, generator=generator
+            return self._donors[0].draw(
+                free[total - count :],
+                swap_prob=self.swap_prob,
+                chosen=chosen,
+                generator=generator,
             )
-            return draw._replace(windows=windows)
         return self.draw_in_batch(
             free,
             count,
             window=self.window,
             swap_prob=self.swap_prob,
-            windows=windows,
+            chosen=chosen,
             generator=generator,
         )
 
@@ -322,21 +321,26 @@ class CounterfactualTransform(BufferTransform, ABC):
         else:
             out = apply_swap(td, plan, values, draw, window=self.window)
         keys, swapped = self.keys, draw.swapped
-        total, changed = td.shape[0], swapped.shape[0] * self.window
-        rows = window_rows(draw.windows, self.window)
-        if rows is None:
-            rows = torch.arange(total - changed, total, device=swapped.device)
-        if self.reward_fn is not None and changed:
+        total, window = td.shape[0], self.window
+        drawn = swapped.shape[0]
+        chosen = draw.chosen
+        if chosen is None:
+            chosen = swapped.new_ones(drawn)
+        if window > 1:
+            swapped = swapped.unsqueeze(1).expand(-1, window, -1).flatten(0, 1)
+            chosen = chosen.unsqueeze(1).expand(-1, window).flatten()
+        chosen = chosen.unsqueeze(-1)
+        if drawn * window < total:
+            kept = swapped.new_zeros(total - drawn * window, swapped.shape[-1])
+            swapped = torch.cat([kept, swapped])
+            chosen = torch.cat([kept[:, :1], chosen])
+        if self.reward_fn is not None and drawn:
             reward = recompute_reward(
-                out, self.layout, self.reward_fn, rows, reward_key=keys.reward
+                out, self.layout, self.reward_fn, chosen, reward_key=keys.reward
             )
             out.set(keys.reward, reward)
-        if self.window > 1:
-            swapped = swapped.unsqueeze(1).expand(-1, self.window, -1).flatten(0, 1)
-        counterfactual = swapped.new_zeros(total, 1)
-        out.set(keys.counterfactual, counterfactual.index_fill_(0, rows, True))
-        flags = swapped.new_zeros(total, swapped.shape[-1])
-        out.set(keys.swapped, flags.index_copy_(0, rows, swapped))
+        out.set(keys.counterfactual, chosen)
+        out.set(keys.swapped, swapped)
         return out
 
     # --- the transform ---------------------------------------------------------------

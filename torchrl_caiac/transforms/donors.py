@@ -275,6 +275,7 @@ class BufferDonors:
         free: torch.Tensor,
         *,
         swap_prob: float = 1.0,
+        chosen: torch.Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> SwapDraw:
         """Draws donors, and the goals of donor windows.
@@ -284,13 +285,17 @@ class BufferDonors:
 
         Keyword Args:
             swap_prob (float): probability of swapping a free entity. Defaults to 1.
+            chosen (torch.Tensor, optional): bool ``[C]``, which of these windows become
+                counterfactual. Defaults to all of them.
             generator (torch.Generator, optional): source of randomness.
 
         Returns:
             SwapDraw: donors and goals as rows of the donor storage.
         """
         index, trajectories, _ = self.index()
-        draw = self.choose(free, index, swap_prob=swap_prob, generator=generator)
+        draw = self.choose(
+            free, index, swap_prob=swap_prob, chosen=chosen, generator=generator
+        )
         if self.goals is None or trajectories is None:
             return draw
         last = trajectories.later(draw.donors, self.window - 1)

@@ -1,8 +1,8 @@
 """Random draws: which entities are swapped, and which donors they get.
 
 Every function is pure. A *window* is ``window`` consecutive rows of a flat batch, ``B``
-is the number of windows, ``C`` the number of counterfactual windows, ``N`` the number
-of entities.
+is the number of windows, ``C`` the number of windows that are drawn for (the last ones
+of the batch), ``N`` the number of entities.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ class SwapDraw(NamedTuple):
             entity was to be swapped but had no donor.
         goal_rows (torch.Tensor, optional): int64 ``[C, N]``, the row of the donor
             storage whose next state is the goal of the donor window.
-        windows (torch.Tensor, optional): int64 ``[C]``, ascending, the counterfactual
-            windows of the batch; the last ones by default.
+        chosen (torch.Tensor, optional): bool ``[C]``, which of the windows become
+            counterfactual; all of them by default.
     """
 
     donors: torch.Tensor
     swapped: torch.Tensor
     no_donor: torch.Tensor
     goal_rows: torch.Tensor | None = None
-    windows: torch.Tensor | None = None
+    chosen: torch.Tensor | None = None
 
 
 class DonorIndex(NamedTuple):
@@ -93,32 +93,37 @@ def draw_windows(
     device: torch.device,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draws windows of a batch without replacement.
+    """Draws which windows of a batch become counterfactual.
 
     Args:
         windows (int): the number of windows in the batch, ``B``.
-        count (int): the number of windows to draw, ``C``.
+        count (int): the number of windows to choose.
 
     Keyword Args:
         device (torch.device): the device of the result.
         generator (torch.Generator, optional): source of randomness.
 
     Returns:
-        torch.Tensor: int64 ``[C]``, ascending.
+        torch.Tensor: bool ``[B]``, true for exactly ``count`` windows.
 
     Examples:
         >>> import torch
         >>> from torchrl_caiac.transforms.draws import draw_windows
-        >>> draw_windows(3, 3, device=torch.device("cpu"))
-        tensor([0, 1, 2])
+        >>> draw_windows(9, 4, device=torch.device("cpu")).sum()
+        tensor(4)
     """
     order = draw_numbers(torch.randperm, windows, device=device, generator=generator)
-    return order[:count].sort().values
+    return order < count
 
 
 def _drawn(
-    free: torch.Tensor, swap_prob: float, generator: torch.Generator | None
+    free: torch.Tensor,
+    swap_prob: float,
+    chosen: torch.Tensor | None,
+    generator: torch.Generator | None,
 ) -> torch.Tensor:
+    if chosen is not None:
+        free = free & chosen.unsqueeze(-1)
     if swap_prob >= 1.0:
         return free
     chance = draw_numbers(
@@ -129,29 +134,28 @@ def _drawn(
 
 def draw_batch_donors(
     free: torch.Tensor,
-    num_counterfactual: int,
+    num_windows: int,
     *,
     window: int = 1,
     swap_prob: float = 1.0,
-    windows: torch.Tensor | None = None,
+    chosen: torch.Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> SwapDraw:
     """Draws donors among the windows of the batch itself.
 
-    Each entity of each counterfactual window draws one of the *other* windows in which
+    Each entity of each chosen window draws one of the *other* windows in which
     it is free too, all with the same probability and independently of the other
     entities.
 
     Args:
         free (torch.Tensor): bool ``[B, N]``, the entities that may be swapped.
-        num_counterfactual (int): the number of windows that become counterfactual,
-            ``C``.
+        num_windows (int): the number of windows that are drawn for, ``C``.
 
     Keyword Args:
         window (int): rows in a window. Defaults to 1.
         swap_prob (float): probability of swapping a free entity. Defaults to 1.
-        windows (torch.Tensor, optional): int64 ``[C]``, the windows that become
-            counterfactual. Defaults to the last ones.
+        chosen (torch.Tensor, optional): bool ``[C]``, which of these windows become
+            counterfactual. Defaults to all of them.
         generator (torch.Generator, optional): source of randomness.
 
     Returns:
@@ -166,14 +170,12 @@ def draw_batch_donors(
         (tensor([[0, 1]]), tensor([[True, True]]))
     """
     count, entities = free.shape
-    first = count - num_counterfactual
-    chosen = free[first:] if windows is None else free.index_select(0, windows)
-    is_chosen = _drawn(chosen, swap_prob, generator).t()
+    first = count - num_windows
+    is_chosen = _drawn(free[first:], swap_prob, chosen, generator).t()
     free = free.t()
     # rank[n, b]: the number of free windows of entity n up to and including window b.
     rank = free.cumsum(1)
-    total = rank[:, -1:]
-    own = rank[:, first:] if windows is None else rank.index_select(1, windows)
+    total, own = rank[:, -1:], rank[:, first:]
     # At least two, of which a remainder can be taken: with fewer there is no donor.
     size = total.clamp_min(2)
     pick = draw_integers(own.shape, device=free.device, generator=generator)
@@ -190,7 +192,7 @@ def draw_batch_donors(
         listed[:, 1:].gather(1, place).t(),
         swapped.t(),
         (is_chosen ^ swapped).sum(1),
-        windows=windows,
+        chosen=chosen,
     )
 
 
@@ -199,6 +201,7 @@ def draw_buffer_donors(
     index: DonorIndex,
     *,
     swap_prob: float = 1.0,
+    chosen: torch.Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> SwapDraw:
     """Draws donors among the eligible windows of a donor storage.
@@ -209,6 +212,8 @@ def draw_buffer_donors(
 
     Keyword Args:
         swap_prob (float): probability of swapping a free entity. Defaults to 1.
+        chosen (torch.Tensor, optional): bool ``[C]``, which of these windows become
+            counterfactual. Defaults to all of them.
         generator (torch.Generator, optional): source of randomness.
 
     Returns:
@@ -224,7 +229,7 @@ def draw_buffer_donors(
         tensor([[ True, False]])
     """
     device = free.device
-    is_chosen = _drawn(free, swap_prob, generator)
+    is_chosen = _drawn(free, swap_prob, chosen, generator)
     size = index.size.to(device)
     pick = draw_integers(free.shape, device=device, generator=generator)
     pick = (pick % size.clamp_min(1) + index.offset.to(device)).clamp_max_(
@@ -233,4 +238,4 @@ def draw_buffer_donors(
     found = size > 0
     donors = pick_rows(index.starts, pick).to(device, torch.int64)
     swapped = is_chosen & found
-    return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0))
+    return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0), chosen=chosen)

@@ -11,7 +11,6 @@ __all__ = [
     "pick_rows",
     "plain_tensor",
     "window_max",
-    "window_rows",
     "window_starts",
 ]
 
@@ -82,28 +81,6 @@ def window_starts(windows: int, window: int, device: torch.device) -> torch.Tens
         torch.Tensor: int64 ``[B]``.
     """
     return torch.arange(0, windows * window, window, device=device)
-
-
-def window_rows(windows: torch.Tensor | None, window: int) -> torch.Tensor | None:
-    """Returns the rows of some windows of a flat batch.
-
-    Args:
-        windows (torch.Tensor, optional): int64 ``[C]``.
-        window (int): rows in a window.
-
-    Returns:
-        torch.Tensor, optional: int64 ``[C * window]``; ``None`` for ``None``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.transforms.indexing import window_rows
-        >>> window_rows(torch.tensor([2, 0]), 2)
-        tensor([4, 5, 0, 1])
-    """
-    if windows is None or window == 1:
-        return windows
-    steps = torch.arange(window, device=windows.device)
-    return torch.add(steps, windows.unsqueeze(-1), alpha=window).flatten()
 
 
 def window_max(scores: torch.Tensor, window: int) -> torch.Tensor:

@@ -18,17 +18,17 @@ RewardFn = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 def _goal_vectors(
-    td: TensorDictBase, layout: EntityLayout, rows: torch.Tensor
+    td: TensorDictBase, layout: EntityLayout
 ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """Returns the next achieved and the desired goals of rows."""
+    """Returns the next achieved and the desired goals."""
     if layout.is_flat:
         desired = td.get(layout.desired_goal_key, None)
         achieved = td.get(layout.next(layout.achieved_goal_key), None)
         if achieved is None and layout.achieved:
             achieved = layout.achieved_goal(td, next=True)
         return (
-            None if achieved is None else achieved[rows],
-            None if desired is None else desired[rows],
+            achieved,
+            desired,
         )
     achieved_parts: list[torch.Tensor] = []
     desired_parts: list[torch.Tensor] = []
@@ -46,7 +46,6 @@ def _goal_vectors(
             value = None if where is None else td.get(where, None)
             if value is None:
                 return None, None
-            value = value[rows]
             if isinstance(value, torch.Tensor):
                 parts.append(value.reshape(len(value), -1))
             else:
@@ -60,7 +59,7 @@ def recompute_reward(
     td: TensorDictBase,
     layout: EntityLayout,
     reward_fn: RewardFn,
-    rows: torch.Tensor,
+    chosen: torch.Tensor,
     *,
     reward_key: NestedKey = ("next", "reward"),
 ) -> torch.Tensor:
@@ -70,9 +69,9 @@ def recompute_reward(
         td (TensorDictBase): the batch after swapping, ``[R]``.
         layout (EntityLayout): the entities. A nested layout's goals are concatenated,
             flattened, in layout order.
-        reward_fn (callable): ``(next_achieved [C, G], desired [C, G])`` to rewards
-            ``[C]`` or ``[C, 1]``.
-        rows (torch.Tensor): int64 ``[C]``, the rows whose rewards are recomputed.
+        reward_fn (callable): ``(next_achieved [R, G], desired [R, G])`` to rewards
+            ``[R]`` or ``[R, 1]``.
+        chosen (torch.Tensor): bool ``[R, 1]``, the rows whose rewards are recomputed.
 
     Keyword Args:
         reward_key (NestedKey): the rewards ``[R]`` or ``[R, 1]``.
@@ -103,13 +102,13 @@ def recompute_reward(
         ...     },
         ...     [2],
         ... )
-        >>> last = torch.tensor([1])
+        >>> last = torch.tensor([[False], [True]])
         >>> recompute_reward(td, layout, lambda a, d: -(a - d).norm(dim=-1), last)
         tensor([[ 0.],
                 [-2.]])
     """
     reward = stored_reward(td, reward_key)
-    achieved, desired = _goal_vectors(td, layout, rows)
+    achieved, desired = _goal_vectors(td, layout)
     if achieved is None or desired is None:
         what = "next achieved goals" if achieved is None else "desired goals"
         raise KeyError(
@@ -117,8 +116,8 @@ def recompute_reward(
             f"{layout.desired_goal_key!r} and {layout.achieved_goal_key!r} (or its "
             "`goal` and `achieved` keys)"
         )
-    new = call_reward(reward_fn, achieved, desired, reward[rows])
-    return reward.to(new.dtype).index_copy(0, rows, new)
+    new = call_reward(reward_fn, achieved, desired, reward)
+    return torch.where(chosen.view_as(reward), new, reward.to(new.dtype))
 
 
 def stored_reward(td: TensorDictBase, reward_key: NestedKey) -> torch.Tensor:

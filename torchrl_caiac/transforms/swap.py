@@ -25,7 +25,7 @@ from torchrl_caiac._keys import join
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.transforms.draws import SwapDraw
-from torchrl_caiac.transforms.indexing import pick_places, window_rows, window_starts
+from torchrl_caiac.transforms.indexing import pick_places, window_starts
 
 __all__ = ["SwapLeaf", "SwapPlan", "SwapPlanner", "apply_swap"]
 
@@ -305,8 +305,8 @@ def apply_swap(
 ) -> TensorDictBase:
     """Replaces entities by those of their donors.
 
-    The states, next states, achieved goals and desired goals of the ``C`` windows of
-    the draw follow the swap. Everything else, and all other windows, stay.
+    The states, next states, achieved goals and desired goals of the last ``C`` windows
+    follow the swap. Everything else, and all other windows, stay.
 
     Args:
         td (TensorDictBase): the batch, ``[B * window]``. It is not changed.
@@ -352,12 +352,10 @@ def apply_swap(
     changed = draw.swapped.shape[0]
     if not changed:
         return out
-    changed_rows = window_rows(draw.windows, window)
     first = td.shape[0] - changed * window
     if sources is None:
         starts = window_starts(len(td) // window, window, draw.swapped.device)
-        own = starts[-changed:] if draw.windows is None else draw.windows * window
-        own = own.unsqueeze(-1)
+        own = starts[-changed:].unsqueeze(-1)
     else:
         own = draw.donors.new_zeros(changed, 1)
     # Where nothing is swapped, a row of the batch is its own donor; one more entity,
@@ -382,17 +380,10 @@ def apply_swap(
             kind = leaf.group, value.ndim
             if kind not in masks:
                 masks[kind] = _mask(draw.swapped, leaf, value.ndim)
-            if changed_rows is None:
-                tail = value[first:]
-            else:
-                tail = value.index_select(0, changed_rows)
-            tail = tail.unflatten(0, (changed, window))
+            tail = value[first:].unflatten(0, (changed, window))
             new = new.to(tail.device).view(changed, -1, *tail.shape[2:])
             new = torch.where(masks[kind], new, tail).flatten(0, 1)
-        if changed_rows is None:
-            out.set(leaf.key, torch.cat([value[:first], new]))
-        else:
-            out.set(leaf.key, value.index_copy(0, changed_rows, new))
+        out.set(leaf.key, torch.cat([value[:first], new]) if first else new)
     return out
 
 
