@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
+import subprocess
+import types
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -32,6 +37,30 @@ def cuda(request: pytest.FixtureRequest) -> Iterator[None]:
         pretend_cuda() if is_needed and not torch.cuda.is_available() else nullcontext()
     ):
         yield
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on a disk of 4 MB, a stand-in where none can be mounted."""
+    folder, size = tmp_path / "small_disk", 4 << 20
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if (
+        shutil.which("mount")
+        and not subprocess.run(mount, capture_output=True).returncode
+    ):
+        yield folder
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+        return
+
+    def allocate(descriptor: int, offset: int, nbytes: int) -> None:
+        if offset + nbytes > size:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", allocate)
+    free = types.SimpleNamespace(f_bavail=size, f_frsize=1)
+    monkeypatch.setattr(os, "fstatvfs", lambda descriptor: free)
+    yield folder
 
 
 @pytest.fixture

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import stat
+from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 
 from torchrl_caiac._files import (
+    UnreadableFileError,
     claim_folder,
+    recover_meta,
     remove_leftovers,
+    reserve,
+    safe_meta,
     whole_file,
     whole_folder,
     write_json,
@@ -122,3 +130,95 @@ def test_a_folder_is_claimed_once(tmp_path):
         raise KeyError
     with claim_folder(folder):
         pass
+
+
+def stored(folder: Path) -> TensorDict:
+    rows = TensorDict({"action": torch.ones(3, 2), "next": {"x": torch.ones(3)}}, [3])
+    return rows.memmap(folder)
+
+
+class TestReserve:
+    def test_files_get_their_blocks_and_keep_their_content(self, tmp_path):
+        file = tmp_path / "leaf.memmap"
+        file.write_bytes(b"abc")
+        reserve(file, 1 << 20)
+        assert file.stat().st_blocks * 512 >= file.stat().st_size == 1 << 20
+        assert file.read_bytes()[:4] == b"abc\0"
+        reserve(file, 2)
+        assert file.read_bytes() == b"ab"
+
+    def test_all_sparse_files_of_a_folder(self, tmp_path):
+        rows = TensorDict({"a": torch.zeros(1), "b": {"c": torch.zeros(1)}}, [1])
+        rows.expand(1 << 18).memmap_like(tmp_path)
+        files = sorted(tmp_path.rglob("*.memmap"))
+        assert all(f.stat().st_blocks * 512 < f.stat().st_size for f in files)
+        reserve(tmp_path)
+        assert all(f.stat().st_blocks * 512 >= f.stat().st_size > 0 for f in files)
+
+    def test_a_full_disk_is_an_error_that_names_file_and_sizes(self, small_disk):
+        old, new = small_disk / "old.memmap", small_disk / "new.memmap"
+        old.write_bytes(b"abc")
+        for file in (old, new):
+            with pytest.raises(OSError, match=r"(?s)8388608 bytes, \d+ are free") as e:
+                reserve(file, 8 << 20)
+            assert e.value.errno == errno.ENOSPC and str(file) in str(e.value)
+        assert old.read_bytes() == b"abc" and not new.exists()
+
+    def test_where_space_cannot_be_reserved_the_free_space_decides(
+        self, small_disk, monkeypatch
+    ):
+        monkeypatch.delattr(os, "posix_fallocate")
+        reserve(small_disk / "fits.memmap", 1 << 20)
+        with pytest.raises(OSError, match="the disk is full"):
+            reserve(small_disk / "large.memmap", 8 << 20)
+
+    def test_other_errors_are_not_hidden(self, tmp_path):
+        with pytest.raises(FileNotFoundError):
+            reserve(tmp_path / "missing" / "leaf.memmap", 1)
+
+
+class TestSafeMeta:
+    def test_leaves_no_copies(self, tmp_path):
+        rows = stored(tmp_path)
+        before = sorted(tmp_path.rglob("*"))
+        with safe_meta(tmp_path):
+            assert len(list(tmp_path.rglob("*.bak"))) == 2
+        assert sorted(tmp_path.rglob("*")) == before
+        with safe_meta(tmp_path):
+            rows.make_memmap(("next", "y"), shape=torch.Size([3]))
+        loaded = TensorDict.load_memmap(tmp_path)
+        assert ("next", "y") in loaded.keys(True)
+
+    @pytest.mark.parametrize("emptied", ["meta.json", "next/meta.json"])
+    @pytest.mark.parametrize("key", ["y", ("next", "y"), ("new", "y")])
+    def test_a_killed_addition_is_undone(self, tmp_path, key, emptied):
+        rows = stored(tmp_path)
+        kept = {f: f.read_bytes() for f in tmp_path.rglob("meta.json")}
+        guard = safe_meta(tmp_path)
+        guard.__enter__()  # and never leaves, as in a killed process
+        rows.make_memmap(key, shape=torch.Size([3]))
+        (tmp_path / emptied).write_text("")
+        assert recover_meta(tmp_path)
+        assert {f: f.read_bytes() for f in kept} == kept
+        assert set(TensorDict.load_memmap(tmp_path).keys()) == {"action", "next"}
+        assert not recover_meta(tmp_path)
+
+    def test_an_error_restores_at_once(self, tmp_path):
+        stored(tmp_path)
+        kept = (tmp_path / "meta.json").read_text()
+        with pytest.raises(OSError, match="full"), safe_meta(tmp_path):
+            (tmp_path / "meta.json").write_text("")
+            raise OSError("full")
+        assert (tmp_path / "meta.json").read_text() == kept
+        assert not list(tmp_path.rglob("*.bak"))
+
+    def test_damage_without_a_copy_is_an_error(self, tmp_path):
+        stored(tmp_path)
+        (tmp_path / "next" / "meta.json").write_text("{")
+        assert not recover_meta(tmp_path)
+        with (
+            pytest.raises(UnreadableFileError, match=r"next/meta\.json is damaged"),
+            safe_meta(tmp_path),
+        ):
+            pass
+        assert not list(tmp_path.rglob("*.bak"))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import logging
 import os
 import re
 import shutil
@@ -15,15 +17,41 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 __all__ = [
+    "UnreadableFileError",
     "claim_folder",
     "plain",
+    "recover_meta",
     "remove_leftovers",
+    "reserve",
+    "safe_meta",
     "whole_file",
     "whole_folder",
     "write_json",
 ]
 
+_logger = logging.getLogger("torchrl_caiac")
+
 _PARTIAL = ".partial-"
+_META = "meta.json"  # tensordict's, one in every folder of a memory-mapped tensordict
+_META_COPY = "meta.json.bak"
+
+
+class UnreadableFileError(ValueError):
+    """A file or folder is truncated, damaged, or not what it should be.
+
+    The message names the path, what was found, and what to do.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.data import UnreadableFileError
+        >>> with tempfile.NamedTemporaryFile() as file:
+        ...     try:
+        ...         EntityLayout.load(file.name)
+        ...     except UnreadableFileError as error:
+        ...         file.name in str(error)
+        True
+    """
 
 
 @contextmanager
@@ -127,6 +155,176 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def reserve(path: str | os.PathLike[str], nbytes: int | None = None) -> None:
+    """Allocates the space of files, before they are written through memory.
+
+    A memory-mapped file has no blocks until it is written to. If the disk is full by
+    then, the operating system ends the process by a signal. After this call there is
+    space for every byte. The content of the files is not changed.
+
+    Args:
+        path (path): a file, created if it is missing; or a folder, for all files in it
+            and in its subfolders.
+        nbytes (int, optional): the size that the file gets. Defaults to ``None``: the
+            current size of each file.
+
+    Raises:
+        OSError: with ``errno.ENOSPC``, the disk has too little space. A file that this
+            call created is removed, one that it enlarged has its old size.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import reserve
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     reserve(f"{folder}/score.memmap", 4096)
+        ...     os.path.getsize(f"{folder}/score.memmap")
+        4096
+    """
+    path = Path(path)
+    if path.is_dir():
+        for file in sorted(item for item in path.rglob("*") if item.is_file()):
+            _reserve_file(file, file.stat().st_size)
+    else:
+        _reserve_file(path, path.stat().st_size if nbytes is None else nbytes)
+
+
+def _reserve_file(file: Path, nbytes: int) -> None:
+    before = file.stat().st_size if file.exists() else None
+    descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        os.ftruncate(descriptor, nbytes)
+        if nbytes:
+            _allocate(descriptor, nbytes)
+    except OSError as error:
+        if before is None:
+            file.unlink()
+        else:
+            os.ftruncate(descriptor, before)
+        if error.errno not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+            raise
+        free = shutil.disk_usage(file.parent).free
+        raise OSError(
+            errno.ENOSPC,
+            f"the disk is full: {file} needs {nbytes} bytes, {free} are free; make "
+            "space, or give a folder on another disk",
+        ) from error
+    finally:
+        os.close(descriptor)
+
+
+def _allocate(descriptor: int, nbytes: int) -> None:
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(descriptor, 0, nbytes)
+            return
+        except OSError as error:
+            # Some file systems do not support it.
+            if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise
+    system = os.fstatvfs(descriptor)
+    used = os.fstat(descriptor).st_blocks * 512
+    if nbytes - used > system.f_bavail * system.f_frsize:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@contextmanager
+def safe_meta(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Context manager for adding leaves to a memory-mapped tensordict.
+
+    tensordict writes ``meta.json`` in place, so a process that is killed may leave an
+    empty one. In the block, a copy of every ``meta.json`` lies beside it. If the
+    process is killed, :func:`recover_meta` restores them, and
+    :func:`~torchrl_caiac.data.load_transitions` calls it. If the block raises, damaged
+    files are restored at once.
+
+    Args:
+        folder (path): the outermost folder of the tensordict.
+
+    Raises:
+        UnreadableFileError: a ``meta.json`` is damaged, and there is no copy.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._files import safe_meta
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     data = TensorDict({"action": torch.zeros(3, 2)}, [3]).memmap(folder)
+        ...     with safe_meta(folder):
+        ...         _ = data.make_memmap(("caiac", "score"), shape=[3, 2])
+        ...     sorted(os.listdir(folder))
+        ['action.memmap', 'caiac', 'meta.json']
+    """
+    recover_meta(folder)
+    files = _meta_files(folder)
+    damaged = [str(file) for file in files if not _is_json(file)]
+    if damaged:
+        raise UnreadableFileError(
+            f"{', '.join(damaged)} is damaged, and has no copy to restore: delete the "
+            "folder and create the data again"
+        )
+    for file in files:
+        with whole_file(file.with_name(_META_COPY)) as partial:
+            shutil.copyfile(file, partial)
+    try:
+        yield
+    finally:
+        recover_meta(folder)
+        for file in files:
+            file.with_name(_META_COPY).unlink(missing_ok=True)
+
+
+def recover_meta(folder: str | os.PathLike[str]) -> bool:
+    """Undoes the addition of a leaf that was killed, where :func:`safe_meta` was used.
+
+    Nothing happens if every ``meta.json`` can be read. Otherwise, all of them become
+    what they were before the leaf.
+
+    Args:
+        folder (path): the outermost folder of a memory-mapped tensordict.
+
+    Returns:
+        bool: whether files were restored.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import recover_meta
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(f"{folder}/meta.json").write_text("")
+        ...     _ = Path(f"{folder}/meta.json.bak").write_text("{}")
+        ...     recover_meta(folder), Path(f"{folder}/meta.json").read_text()
+        (True, '{}')
+    """
+    copies = [
+        file
+        for file in Path(folder).rglob(_META_COPY)
+        if file.is_file() and _is_json(file)
+    ]
+    if not copies or all(_is_json(file) for file in _meta_files(folder)):
+        return False
+    # All, not only the damaged one: an outer file may list what an inner one lost.
+    for copy in sorted(copies):
+        with whole_file(copy.with_name(_META)) as partial:
+            shutil.copyfile(copy, partial)
+    _logger.warning(
+        "%s: a leaf was being added when a process was killed; meta.json is restored, "
+        "without that leaf",
+        folder,
+    )
+    return True
+
+
+def _meta_files(folder: str | os.PathLike[str]) -> list[Path]:
+    return sorted(file for file in Path(folder).rglob(_META) if file.is_file())
+
+
+def _is_json(file: Path) -> bool:
+    try:
+        return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
+    except (ValueError, RecursionError):
+        return False
 
 
 def plain(value: Any) -> Any:

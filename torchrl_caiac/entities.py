@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac import _columns
-from torchrl_caiac._files import write_json
+from torchrl_caiac._files import UnreadableFileError, write_json
 from torchrl_caiac._keys import as_key, join
 from torchrl_caiac._layout_format import layout_arguments, layout_text, layout_to_dict
 from torchrl_caiac._layout_reading import (
@@ -573,7 +573,9 @@ class EntityLayout:
         try:
             return cls.from_dict(json.loads(text))
         except ValueError as error:  # JSONDecodeError is one
-            raise ValueError(f"{path} is not a readable layout: {error}") from error
+            raise UnreadableFileError(
+                f"{path} is not a readable layout: {error}"
+            ) from error
 
     # --- comparing and showing ---------------------------------------------------
 

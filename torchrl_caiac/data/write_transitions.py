@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_caiac._files import whole_folder
+from torchrl_caiac._files import reserve, whole_folder
+from torchrl_caiac.data.action_bounds import write_action_bounds
 from torchrl_caiac.data.load_transitions import load_transitions
 
 __all__ = ["check_free", "write_transitions"]
@@ -35,7 +38,11 @@ def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> 
 
 
 def write_transitions(
-    data: TensorDictBase, path: str | os.PathLike[str], *, overwrite: bool = False
+    data: TensorDictBase,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    action_bounds: tuple[Any, Any] | None = None,
 ) -> TensorDict:
     """Writes transitions to a folder, atomically, and opens it.
 
@@ -46,12 +53,18 @@ def write_transitions(
     Keyword Args:
         overwrite (bool): whether to replace ``path`` if it exists. Defaults to
             ``False``.
+        action_bounds (tuple of torch.Tensor or sequence, optional): the lowest and the
+            highest action, ``[A]`` each, finite. They are stored beside the
+            transitions, see :func:`~torchrl_caiac.data.action_bounds`. Defaults to
+            ``None``: the bounds are unknown.
 
     Returns:
         TensorDict: the memory-mapped transitions, ``[T]``.
 
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        OSError: the disk is full.
+        ValueError: ``action_bounds`` are not bounds of the actions.
 
     Examples:
         >>> import tempfile
@@ -71,6 +84,21 @@ def write_transitions(
         True
     """
     check_free(path, overwrite)
+    if action_bounds is not None:
+        _check_bounds(data, action_bounds)
     with whole_folder(path) as folder:
-        data.memmap(folder)
+        stored = data.memmap_like(folder)
+        reserve(folder)
+        stored.update_(data)
+        if action_bounds is not None:
+            write_action_bounds(folder, *action_bounds)
     return load_transitions(Path(path))
+
+
+def _check_bounds(data: TensorDictBase, bounds: tuple[Any, Any]) -> None:
+    action, shape = data.get("action", None), list(torch.as_tensor(bounds[0]).shape)
+    if action is not None and list(action.shape[data.batch_dims :]) != shape:
+        raise ValueError(
+            f"action_bounds have shape {shape}, but 'action' has shape "
+            f"{list(action.shape)}: give one bound for each number of an action"
+        )
