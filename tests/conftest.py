@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -61,6 +61,26 @@ def small_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
     free = types.SimpleNamespace(f_bavail=size, f_frsize=1)
     monkeypatch.setattr(os, "fstatvfs", lambda descriptor: free)
     yield folder
+
+
+@pytest.fixture
+def read_only() -> Iterator[Callable[[Path], None]]:
+    """A function that makes a folder read-only until the test ends, also for root."""
+    mounted: list[Path] = []
+
+    def protect(folder: Path) -> None:
+        if os.geteuid():
+            for path in (folder, *folder.rglob("*")):
+                path.chmod(path.stat().st_mode & ~0o222)
+        else:
+            subprocess.run(["mount", "--bind", folder, folder], check=True)
+            mounted.append(folder)
+            remount = ["mount", "-o", "remount,ro,bind", folder]
+            subprocess.run(remount, check=True)
+
+    yield protect
+    for folder in mounted:
+        subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,8 +19,10 @@ from filelock import FileLock, Timeout
 
 __all__ = [
     "UnreadableFileError",
+    "check_archive",
     "claim_folder",
     "plain",
+    "read_json",
     "recover_meta",
     "remove_leftovers",
     "reserve",
@@ -32,6 +35,7 @@ __all__ = [
 _logger = logging.getLogger("torchrl_caiac")
 
 _PARTIAL = ".partial-"
+_MOST_JSON = 64 << 20  # bytes; settings, layouts and records are far smaller
 _META = "meta.json"  # tensordict's, one in every folder of a memory-mapped tensordict
 _META_COPY = "meta.json.bak"
 
@@ -371,6 +375,92 @@ def write_json(
     text = json.dumps(plain(value), indent=indent) + "\n"
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def read_json(path: str | os.PathLike[str], what: str, remedy: str) -> Any:
+    """Reads a JSON file.
+
+    Args:
+        path (path): the file.
+        what (str): what the file is, for the error message, such as ``"a layout"``.
+        remedy (str): the end of the message, which says what to do.
+
+    Returns:
+        Any: the content.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UnreadableFileError: it is not a file, is not JSON, or is too large for JSON.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import read_json
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(f"{folder}/a.json").write_text('{"b": 1}')
+        ...     read_json(f"{folder}/a.json", "a record", "delete it")
+        {'b': 1}
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    try:
+        if not path.is_file():
+            raise ValueError("it is not a file")
+        if size > _MOST_JSON:
+            raise ValueError(f"it has {size} bytes, expected at most {_MOST_JSON}")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UnreadableFileError(
+            f"{path} is damaged or is not {what} ({error}): {remedy}"
+        ) from error
+
+
+def check_archive(path: str | os.PathLike[str], what: str, remedy: str) -> None:
+    """Raises if a ZIP file cannot be read in the space that it takes on disk.
+
+    The files of this package are not compressed. A small compressed file could expand
+    to any size.
+
+    Args:
+        path (path): the file.
+        what (str): what the file is, for the error message.
+        remedy (str): the end of the message, which says what to do.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UnreadableFileError: it is not a ZIP file, has compressed or encrypted parts, or
+            parts that are larger than the file.
+
+    Examples:
+        >>> import tempfile, zipfile
+        >>> from torchrl_caiac._files import check_archive
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with zipfile.ZipFile(f"{folder}/a.zip", "w") as archive:
+        ...         archive.writestr("b", "1")
+        ...     check_archive(f"{folder}/a.zip", "an archive", "delete it")
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    try:
+        if not path.is_file():
+            raise ValueError("it is not a file")
+        with zipfile.ZipFile(path) as archive:
+            parts = archive.infolist()
+        packed = [
+            part.filename
+            for part in parts
+            if part.compress_type != zipfile.ZIP_STORED
+            or part.flag_bits & 1  # encrypted
+            or part.compress_size != part.file_size
+        ]
+        if packed:
+            raise ValueError(f"{packed} are compressed or encrypted")
+        total = sum(part.file_size for part in parts)
+        if total > size:
+            raise ValueError(f"its parts have {total} bytes, the file has {size}")
+    except Exception as error:  # zipfile raises many kinds for damaged files
+        raise UnreadableFileError(
+            f"{path} is damaged or is not {what} ({error}): {remedy}"
+        ) from error
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_caiac._files import UnreadableFileError, write_json
+from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 from torchrl_caiac._torchrl import memmap_folder
 
 __all__ = ["action_bounds", "write_action_bounds"]
@@ -77,13 +76,14 @@ def action_bounds(
     file = Path(folder) / _FILE
     if not file.exists():
         return None
+    what = "the bounds of an action space"
+    remedy = "create the data again, or delete this file if the bounds are unknown"
+    content = read_json(file, what, remedy)
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
         return _checked(content["low"], content["high"])
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UnreadableFileError(
-            f"{file} does not have the bounds of an action space ({error}): create the "
-            "data again, or delete this file if the bounds are unknown"
+            f"{file} does not have {what} ({error!r}): {remedy}"
         ) from error
 
 

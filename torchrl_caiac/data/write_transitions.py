@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_caiac._files import reserve, whole_folder
 from torchrl_caiac.data.action_bounds import write_action_bounds
+from torchrl_caiac.data.digests import write_digests
 from torchrl_caiac.data.load_transitions import load_transitions
 
 __all__ = ["check_free", "write_transitions"]
@@ -90,6 +91,7 @@ def write_transitions(
         stored = data.memmap_like(folder)
         reserve(folder)
         stored.update_(data)
+        write_digests(folder)
         if action_bounds is not None:
             write_action_bounds(folder, *action_bounds)
     return load_transitions(Path(path))
