@@ -2,16 +2,21 @@ from __future__ import annotations
 
 import copy
 import json
+import traceback
 from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+import torchrl_caiac
+from tests.mutations import mutate_file, mutate_json
 from torchrl_caiac import EntityLayout
+from torchrl_caiac.data import UnreadableFileError
 
+PACKAGE = str(Path(torchrl_caiac.__file__).parent)
 GOAL = {"cube0": range(3), "cube1": range(3, 6)}
 ACHIEVED = {"cube0": range(10, 13), "cube1": range(22, 25)}
 
@@ -263,7 +268,7 @@ class TestSaving:
         path = tmp_path / "layout.json"
         fetch().save(path)
         path.write_text(path.read_text()[:cut])
-        with pytest.raises(ValueError, match="not a readable layout"):
+        with pytest.raises(ValueError, match="damaged or is not a layout"):
             EntityLayout.load(path)
 
     @pytest.mark.parametrize(
@@ -274,6 +279,47 @@ class TestSaving:
         path.write_text(json.dumps(fetch().to_dict() | change))
         with pytest.raises(ValueError, match=r"layout\.json"):
             EntityLayout.load(path)
+
+    @settings(max_examples=500)
+    @given(st.sampled_from([fetch(), nested()]), st.randoms(use_true_random=False))
+    def test_a_damaged_dict_is_a_layout_or_one_error(self, layout, rng):
+        content = mutate_json(layout.to_dict(), rng)
+        try:
+            found = EntityLayout.from_dict(content)
+        except (ValueError, TypeError) as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            assert frames[-1].filename.startswith(PACKAGE)
+            assert len(str(error)) > 20
+        else:
+            assert len(found.names) == len(content["entities"])
+            assert found == EntityLayout.from_dict(found.to_dict())
+            repr(found)
+
+    def test_each_unknown_and_doubled_part_is_named(self):
+        content = fetch().to_dict()
+        for change, match in (
+            ({"fixd": []}, "fixd"),
+            ({"entities": [["a", [0]], ["a", [1]]]}, r"each name once.*'a', 'a'"),
+            ({"entities": [["a", [2**31]]]}, "columns from 0 to 2147483647"),
+            ({"flat": 1}, "flat of the layout: expected true or false, got 1"),
+            ({"next_key": []}, "next_key"),
+        ):
+            with pytest.raises(ValueError, match=match):
+                EntityLayout.from_dict(content | change)
+
+    def test_text_of_far_columns_takes_no_memory(self):
+        assert "[0, 1000000000]" in repr(EntityLayout({"a": [0, 10**9]}))
+
+    @settings(max_examples=200)
+    @given(st.randoms(use_true_random=False))
+    def test_a_damaged_file_is_a_layout_or_one_error(self, tmp_path_factory, rng):
+        path = tmp_path_factory.mktemp("damaged") / "layout.json"
+        nested().save(path)
+        mutate_file(path, rng)
+        try:
+            EntityLayout.load(path)
+        except (UnreadableFileError, FileNotFoundError) as error:
+            assert str(path) in str(error)
 
     def test_nothing_half_written(self, tmp_path, monkeypatch):
         path = tmp_path / "layout.json"

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac import _columns
-from torchrl_caiac._files import UnreadableFileError, write_json
+from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 from torchrl_caiac._keys import as_key, join
 from torchrl_caiac._layout_format import layout_arguments, layout_text, layout_to_dict
 from torchrl_caiac._layout_reading import (
@@ -514,6 +514,7 @@ class EntityLayout:
             EntityLayout: the layout.
 
         Raises:
+            TypeError: a name is empty.
             ValueError: the content does not describe a layout, or has another version.
 
         Examples:
@@ -522,13 +523,8 @@ class EntityLayout:
             >>> EntityLayout.from_dict(content).names
             ('arm',)
         """
-        try:
-            is_flat, arguments = layout_arguments(content)
-            return cls(**arguments) if is_flat else cls.from_keys(**arguments)
-        except (KeyError, TypeError) as error:
-            raise ValueError(
-                f"the content does not describe a valid layout: {error}"
-            ) from error
+        is_flat, arguments = layout_arguments(content)
+        return cls(**arguments) if is_flat else cls.from_keys(**arguments)
 
     def save(self, path: str | Path) -> None:
         """Writes the layout as JSON, atomically.
@@ -559,7 +555,7 @@ class EntityLayout:
 
         Raises:
             FileNotFoundError: the file does not exist.
-            ValueError: the file is truncated or does not describe a layout.
+            UnreadableFileError: the file is truncated or does not describe a layout.
 
         Examples:
             >>> import tempfile
@@ -569,12 +565,13 @@ class EntityLayout:
             ...     EntityLayout.load(f"{folder}/layout.json").names
             ('arm',)
         """
-        text = Path(path).read_text(encoding="utf-8")
+        what, remedy = "a layout", "save the layout again"
+        content = read_json(path, what, remedy)
         try:
-            return cls.from_dict(json.loads(text))
-        except ValueError as error:  # JSONDecodeError is one
+            return cls.from_dict(content)
+        except (ValueError, TypeError) as error:
             raise UnreadableFileError(
-                f"{path} is not a readable layout: {error}"
+                f"{path} is not {what} that can be read ({error}): {remedy}"
             ) from error
 
     # --- comparing and showing ---------------------------------------------------
