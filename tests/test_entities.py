@@ -268,7 +268,7 @@ class TestSaving:
         path = tmp_path / "layout.json"
         fetch().save(path)
         path.write_text(path.read_text()[:cut])
-        with pytest.raises(ValueError, match="damaged or is not a layout"):
+        with pytest.raises(ValueError, match="not a readable layout"):
             EntityLayout.load(path)
 
     @pytest.mark.parametrize(

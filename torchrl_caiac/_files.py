@@ -382,7 +382,7 @@ def read_json(path: str | os.PathLike[str], what: str, remedy: str) -> Any:
 
     Args:
         path (path): the file.
-        what (str): what the file is, for the error message, such as ``"a layout"``.
+        what (str): what the file is, for the error message, such as ``"layout"``.
         remedy (str): the end of the message, which says what to do.
 
     Returns:
@@ -397,7 +397,7 @@ def read_json(path: str | os.PathLike[str], what: str, remedy: str) -> Any:
         >>> from torchrl_caiac._files import read_json
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = Path(f"{folder}/a.json").write_text('{"b": 1}')
-        ...     read_json(f"{folder}/a.json", "a record", "delete it")
+        ...     read_json(f"{folder}/a.json", "record", "delete it")
         {'b': 1}
     """
     path = Path(path)
@@ -410,7 +410,8 @@ def read_json(path: str | os.PathLike[str], what: str, remedy: str) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise UnreadableFileError(
-            f"{path} is damaged or is not {what} ({error}): {remedy}"
+            f"{path} is not a readable {what}, it may be truncated or damaged "
+            f"({error}): {remedy}"
         ) from error
 
 
@@ -436,7 +437,7 @@ def check_archive(path: str | os.PathLike[str], what: str, remedy: str) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     with zipfile.ZipFile(f"{folder}/a.zip", "w") as archive:
         ...         archive.writestr("b", "1")
-        ...     check_archive(f"{folder}/a.zip", "an archive", "delete it")
+        ...     check_archive(f"{folder}/a.zip", "archive", "delete it")
     """
     path = Path(path)
     size = path.stat().st_size
@@ -459,7 +460,8 @@ def check_archive(path: str | os.PathLike[str], what: str, remedy: str) -> None:
             raise ValueError(f"its parts have {total} bytes, the file has {size}")
     except Exception as error:  # zipfile raises many kinds for damaged files
         raise UnreadableFileError(
-            f"{path} is damaged or is not {what} ({error}): {remedy}"
+            f"{path} is not a readable {what}, it may be truncated or damaged "
+            f"({error}): {remedy}"
         ) from error
 
 

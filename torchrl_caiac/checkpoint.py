@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import os
@@ -12,11 +13,18 @@ from typing import Any
 import torch
 from torchrl.checkpoint import Checkpoint, GlobalRNGState, StateDictCheckpointAdapter
 
-from torchrl_caiac._files import plain, remove_leftovers, whole_file
+from torchrl_caiac._files import (
+    UnreadableFileError,
+    check_archive,
+    plain,
+    remove_leftovers,
+    whole_file,
+)
 
 __all__ = ["TrainingCheckpoint"]
 
 _CONTENT = "torchrl_caiac.checkpoint/1"
+_WHAT = "checkpoint of this run"
 _ADVICE = "delete it to start from scratch, or give another path"
 
 
@@ -100,12 +108,13 @@ class TrainingCheckpoint:
             int: the number of steps taken, 0 if there is no file.
 
         Raises:
-            ValueError: the file is truncated or not a checkpoint of this run, its
-                settings differ, or it has more than ``max_step`` steps.
+            UnreadableFileError: the file is truncated or not a checkpoint of this run.
+            ValueError: its settings differ, or it has more than ``max_step`` steps.
         """
         remove_leftovers(self.path)
         if not self.path.exists():
             return 0
+        check_archive(self.path, _WHAT, _ADVICE)
         try:
             step, settings = self._read_manifest()
         except Exception as error:
@@ -132,8 +141,6 @@ class TrainingCheckpoint:
 
     def _read_manifest(self) -> tuple[int, dict[str, Any]]:
         """Returns the steps and the settings of the file, after checking its parts."""
-        if not self.path.is_file():
-            raise ValueError("it is not a file")
         manifest = Checkpoint.manifest(self.path)
         metadata, parts = manifest["metadata"], sorted(manifest["components"])
         if metadata.get("content") != _CONTENT:
@@ -142,7 +149,10 @@ class TrainingCheckpoint:
             )
         if parts != sorted(self._parts):
             raise ValueError(f"expected the parts {sorted(self._parts)}, got {parts}")
-        return int(metadata["step"]), dict(metadata["settings"])
+        step, settings = metadata["step"], metadata["settings"]
+        if type(step) is not int or step < 0 or not isinstance(settings, dict):
+            raise ValueError(f"the step is {step!r} and the settings are {settings!r}")
+        return step, settings
 
     def _restore(self, states: Mapping[str, Any]) -> None:
         """Restores all parts, or none."""
@@ -153,14 +163,16 @@ class TrainingCheckpoint:
             for name, part in self._parts.items():
                 part.load_state_dict(states[name])
         except BaseException:
-            for name, part in self._parts.items():
-                part.load_state_dict(before[name])
+            # Each, even where another cannot be restored.
+            with contextlib.ExitStack() as stack:
+                for name, part in self._parts.items():
+                    stack.callback(part.load_state_dict, before[name])
             raise
 
-    def _unreadable(self, error: Exception) -> ValueError:
-        return ValueError(
-            f"{self.path} is not a readable checkpoint of this run, it may be "
-            f"truncated ({error}): {_ADVICE}"
+    def _unreadable(self, error: Exception) -> UnreadableFileError:
+        return UnreadableFileError(
+            f"{self.path} is not a readable {_WHAT}, it may be truncated or damaged "
+            f"({error}): {_ADVICE}"
         )
 
 
@@ -173,8 +185,10 @@ class _TensorsOnly(StateDictCheckpointAdapter):
 
     def load(self, component: Any, path: Path, **kwargs: Any) -> Any:
         """Returns the state; the caller loads it once all states have been read."""
+        file = path / self.state_torch
+        check_archive(file, "state", "the checkpoint is damaged")
         return torch.load(
-            path / self.state_torch,
+            file,
             map_location=kwargs["map_location"],
             weights_only=True,
         )

@@ -565,13 +565,13 @@ class EntityLayout:
             ...     EntityLayout.load(f"{folder}/layout.json").names
             ('arm',)
         """
-        what, remedy = "a layout", "save the layout again"
+        what, remedy = "layout", "save the layout again"
         content = read_json(path, what, remedy)
         try:
             return cls.from_dict(content)
         except (ValueError, TypeError) as error:
             raise UnreadableFileError(
-                f"{path} is not {what} that can be read ({error}): {remedy}"
+                f"{path} is not a readable {what} ({error}): {remedy}"
             ) from error
 
     # --- comparing and showing ---------------------------------------------------

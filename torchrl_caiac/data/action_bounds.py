@@ -76,14 +76,14 @@ def action_bounds(
     file = Path(folder) / _FILE
     if not file.exists():
         return None
-    what = "the bounds of an action space"
+    what = "description of an action space"
     remedy = "create the data again, or delete this file if the bounds are unknown"
     content = read_json(file, what, remedy)
     try:
         return _checked(content["low"], content["high"])
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UnreadableFileError(
-            f"{file} does not have {what} ({error!r}): {remedy}"
+            f"{file} is not a readable {what} ({error!r}): {remedy}"
         ) from error
 
 

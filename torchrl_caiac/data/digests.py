@@ -185,7 +185,7 @@ def _read(folder: Path) -> dict[str, Any]:
             f"{folder} has no {_FILE}, so its content cannot be compared: write it "
             "with write_digests, or create the data again"
         )
-    content = read_json(file, "a file of digests", _AGAIN)
+    content = read_json(file, "file of digests", _AGAIN)
     if (
         not isinstance(content, dict)
         or content.get("format") != _FORMAT

@@ -135,7 +135,7 @@ def _check_folder(
             f"{root} is not a memory-mapped tensordict, {meta} is missing: give "
             f"another folder, or {_AGAIN}"
         )
-    content = read_json(meta, "from tensordict, it may be truncated", _AGAIN)
+    content = read_json(meta, "description of a tensordict", _AGAIN)
     try:
         kind, device = content["_type"], content["device"]
         shape = _shape(content["shape"])
