@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
+from tests.killing import run_killed
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 
 
@@ -115,10 +116,20 @@ class TestTrainingCheckpoint:
     def test_leftovers_of_interrupted_writes_are_removed(self, tmp_path):
         run = Run(tmp_path / "checkpoint.zip", seed=1)
         run.checkpoint.save(1)
-        (tmp_path / ".partial-12-checkpoint.zip").write_text("half")
-        (tmp_path / "..partial-12-checkpoint.zip.archive-0f").write_text("half")
-        (tmp_path / "..partial-12-checkpoint.zip.stage-0f").mkdir()
-        (tmp_path / "..partial-12-checkpoint.zip.stage-0f" / "x").write_text("half")
+
+        def save(**_):
+            checkpoint_save = Checkpoint.save
+
+            def killed(self, *args, **kwargs):
+                checkpoint_save(self, *args, **kwargs)
+                os.kill(os.getpid(), 9)
+
+            Checkpoint.save = killed
+            run.checkpoint.save(2)
+            yield
+
+        run_killed(save)
+        assert len(list(tmp_path.iterdir())) == 2
         others = {".partial-12-other-checkpoint.zip", "a.partial-12-checkpoint.zip"}
         for name in others:
             (tmp_path / name).touch()

@@ -1,11 +1,10 @@
-"""Files and folders are whole or not there, and have one writer."""
+"""Files are checked when they are read, have their space, and one writer."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
-import stat
 from pathlib import Path
 
 import pytest
@@ -17,50 +16,10 @@ from torchrl_caiac._files import (
     UnreadableFileError,
     claim_folder,
     recover_meta,
-    remove_leftovers,
     reserve,
     safe_meta,
-    whole_file,
-    whole_folder,
     write_json,
 )
-
-
-class TestWholeFile:
-    def test_takes_its_place_at_the_end(self, tmp_path):
-        path = tmp_path / "new" / "folder" / "figure.png"
-        with whole_file(path) as partial:
-            assert partial.suffix == ".png"
-            partial.write_text("first")
-            assert not path.exists()
-        assert path.read_text() == "first"
-        with whole_file(str(path)) as partial:
-            partial.write_text("second")
-            assert path.read_text() == "first"
-        assert path.read_text() == "second"
-        assert list(path.parent.iterdir()) == [path]
-
-    def test_errors_leave_the_old_file(self, tmp_path):
-        path = tmp_path / "table.txt"
-        path.write_text("old")
-        with pytest.raises(KeyboardInterrupt), whole_file(path) as partial:
-            partial.write_text("ne")
-            raise KeyboardInterrupt
-        with pytest.raises(FileNotFoundError), whole_file(path):
-            pass  # nothing is written
-        assert path.read_text() == "old"
-        assert list(tmp_path.iterdir()) == [path]
-
-    def test_leftovers_of_interrupted_writes_are_removed(self, tmp_path):
-        path = tmp_path / "table.txt"
-        remove_leftovers(tmp_path / "missing" / "table.txt")
-        writes = [whole_file(tmp_path / name) for name in ("table.txt", "other.txt")]
-        for write in writes:
-            write.__enter__().write_text("half")  # and never leaves
-        assert len(list(tmp_path.iterdir())) == 2
-        remove_leftovers(path)
-        (left,) = tmp_path.iterdir()
-        assert left.name.endswith("other.txt")
 
 
 class TestWriteJson:
@@ -84,35 +43,6 @@ class TestWriteJson:
             write_json(tmp_path / "a.json", {"a": object()})
         assert json.loads((tmp_path / "a.json").read_text()) == [1]
         assert len(list(tmp_path.iterdir())) == 1
-
-
-class TestWholeFolder:
-    def test_what_raises_leaves_the_old_folder(self, tmp_path):
-        path = tmp_path / "a" / "data"
-        for text in ("old", "new"):
-            with whole_folder(path) as partial:
-                partial.mkdir()
-                (partial / "x").write_text(text)
-        with pytest.raises(RuntimeError), whole_folder(path) as partial:
-            partial.mkdir()
-            (partial / "x").write_text("half")
-            raise RuntimeError
-        with pytest.raises(FileNotFoundError), whole_folder(path):
-            pass  # nothing was made: what is there stays
-        assert (path / "x").read_text() == "new"
-        assert list(path.parent.iterdir()) == [path]
-
-
-def test_modes_follow_the_umask(tmp_path):
-    previous = os.umask(0o022)
-    try:
-        write_json(tmp_path / "a.json", 1)
-        with whole_folder(tmp_path / "folder") as partial:
-            partial.mkdir()
-    finally:
-        os.umask(previous)
-    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o644
-    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o755
 
 
 def test_a_folder_is_claimed_once(tmp_path):

@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, and folders with one writing process."""
+"""Reading and writing files: whole, checked, with space, and by one process."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import errno
 import json
 import logging
 import os
-import re
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+
+from torchrl_caiac._whole_files import (
+    remove_leftovers,
+    remove_leftovers_in,
+    whole_file,
+    whole_folder,
+)
 
 __all__ = [
     "UnreadableFileError",
@@ -25,6 +30,7 @@ __all__ = [
     "read_json",
     "recover_meta",
     "remove_leftovers",
+    "remove_leftovers_in",
     "reserve",
     "safe_meta",
     "whole_file",
@@ -34,7 +40,6 @@ __all__ = [
 
 _logger = logging.getLogger("torchrl_caiac")
 
-_PARTIAL = ".partial-"
 _MOST_JSON = 64 << 20  # bytes; settings, layouts and records are far smaller
 _META = "meta.json"  # tensordict's, one in every folder of a memory-mapped tensordict
 _META_COPY = "meta.json.bak"
@@ -56,109 +61,6 @@ class UnreadableFileError(ValueError):
         ...         file.name in str(error)
         True
     """
-
-
-@contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Context manager that writes a file atomically.
-
-    The file replaces ``path`` at the end of the block. If the block raises, the old
-    file is unchanged. Missing parent folders are created.
-
-    Args:
-        path (path): the file to write.
-
-    Yields:
-        Path: a temporary file in the same folder, with the same suffix.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac._files import whole_file
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with whole_file(f"{folder}/results/table.txt") as partial:
-        ...         _ = partial.write_text("42")
-        ...     open(f"{folder}/results/table.txt").read()
-        '42'
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{_PARTIAL}{os.getpid()}-{path.name}")
-    try:
-        yield partial
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def remove_leftovers(path: str | os.PathLike[str]) -> None:
-    """Removes the partial files of interrupted calls of :func:`whole_file`.
-
-    Temporary files and folders whose names begin with that of a partial file, which
-    other libraries create, are removed too. No other process may be writing the file.
-
-    Args:
-        path (path): the file.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac._files import remove_leftovers
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = Path(f"{folder}/.partial-7-table.txt").write_text("4")
-        ...     remove_leftovers(f"{folder}/table.txt")
-        ...     os.listdir(folder)
-        []
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        return
-    pattern = rf"\.?{re.escape(_PARTIAL)}\d+-{re.escape(path.name)}(\.\w+-\w+)?"
-    for left in path.parent.iterdir():
-        if re.fullmatch(pattern, left.name):
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                left.unlink(missing_ok=True)
-
-
-@contextmanager
-def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Context manager that writes a folder atomically.
-
-    The folder replaces ``path`` at the end of the block. If the block raises, the old
-    folder is unchanged. Missing parent folders are created.
-
-    Args:
-        path (path): the folder to write.
-
-    Yields:
-        Path: a temporary folder on the same file system, to be created in the block.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac._files import whole_folder
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with whole_folder(f"{folder}/data") as partial:
-        ...         partial.mkdir()
-        ...     os.path.isdir(f"{folder}/data")
-        True
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
-    made, replaced = partial / path.name, partial / f"replaced-{path.name}"
-    try:
-        yield made
-        was_there = path.exists()
-        if was_there:
-            os.replace(path, replaced)
-        try:
-            os.replace(made, path)
-        except OSError:
-            if was_there:
-                os.replace(replaced, path)
-            raise
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def reserve(path: str | os.PathLike[str], nbytes: int | None = None) -> None:

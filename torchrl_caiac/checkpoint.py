@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import hashlib
 import json
 import os
+import shutil
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ from torchrl_caiac._files import (
 __all__ = ["TrainingCheckpoint"]
 
 _CONTENT = "torchrl_caiac.checkpoint/1"
+_MANIFEST = "manifest.json"  # TorchRL's
 _WHAT = "checkpoint of this run"
 _ADVICE = "delete it to start from scratch, or give another path"
 
@@ -37,6 +41,7 @@ class TrainingCheckpoint:
     (:class:`~torchrl.checkpoint.Checkpoint`) in the archive format.
 
     - A file is written atomically: an interrupted write leaves the old file as it was.
+    - Runs that do the same write the same bytes: the file has no date and no random id.
     - Loading is all or nothing: if :meth:`load` raises, no part has changed.
     - Loading executes no code from the file: only tensors and plain containers are
       read.
@@ -81,7 +86,7 @@ class TrainingCheckpoint:
         # Through JSON, so that tuples equal lists.
         self._settings = json.loads(json.dumps(plain(settings or {})))
         self._parts = {**parts, "rng": GlobalRNGState()} if rng else parts
-        self._checkpoint = Checkpoint(format="archive")
+        self._checkpoint = Checkpoint(format="directory")
         for name, part in self._parts.items():
             self._checkpoint.register(name, part, adapter=_TensorsOnly("torch"))
 
@@ -94,7 +99,12 @@ class TrainingCheckpoint:
         metadata = {"content": _CONTENT, "step": step, "settings": self._settings}
         # TorchRL moves an old file away before it puts the new one in its place.
         with whole_file(self.path) as partial:
-            self._checkpoint.save(partial, metadata=metadata)
+            parts = partial.with_name(f"{partial.name}.parts-0")
+            try:
+                self._checkpoint.save(parts, metadata=metadata)
+                _write_archive(parts, partial)
+            finally:
+                shutil.rmtree(parts, ignore_errors=True)
 
     def load(self, *, max_step: int | None = None) -> int:
         """Restores all parts if the file exists.
@@ -192,6 +202,34 @@ class _TensorsOnly(StateDictCheckpointAdapter):
             map_location=kwargs["map_location"],
             weights_only=True,
         )
+
+
+def _write_archive(parts: Path, archive: Path) -> None:
+    """Writes a folder of :class:`Checkpoint` in its archive format.
+
+    TorchRL's own archives have the time of saving and a random id, these have not.
+    """
+    manifest = parts / _MANIFEST
+    files = sorted(file for file in parts.rglob("*") if file.is_file())
+    digest = hashlib.sha256()
+    with zipfile.ZipFile(archive, "w") as target:
+        for file in [file for file in files if file != manifest]:
+            name = file.relative_to(parts).as_posix()
+            digest.update(name.encode())
+            info = zipfile.ZipInfo(name)
+            info.file_size = file.stat().st_size  # decides on ZIP64
+            with file.open("rb") as source, target.open(info, "w") as sink:
+                while chunk := source.read(1 << 20):
+                    digest.update(chunk)
+                    sink.write(chunk)
+        content = json.loads(manifest.read_text(encoding="utf-8"))
+        content |= {
+            "container": "archive",
+            "checkpoint_id": digest.hexdigest()[:32],
+            "created_at": "1980-01-01T00:00:00+00:00",
+        }
+        text = json.dumps(content, indent=2, sort_keys=True)
+        target.writestr(zipfile.ZipInfo(_MANIFEST), text + "\n")
 
 
 def _differences(saved: Any, given: Any, name: str = "") -> Iterator[str]:

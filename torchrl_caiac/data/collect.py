@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torchrl_caiac._files import (
     UnreadableFileError,
     read_json,
+    remove_leftovers_in,
     whole_file,
     write_json,
 )
@@ -149,6 +150,7 @@ def collect_episodes(
         raise ValueError(f"workers is {workers}, expected at least 1")
     root = Path(folder)
     _claim_folder(root, seed, specs)
+    remove_leftovers_in(root)
     files = [root / f"episode_{index:06d}.npz" for index in range(len(specs))]
     failures = {
         index: load_episode(file)[1]["attempts"] - 1
@@ -333,7 +335,7 @@ def _collect_episode(
         flat = _flat(arrays)
         meta = {"spec": spec, "seed": seed, "attempts": attempt + 1}
         flat[_META] = np.array(json.dumps(meta))
-        with whole_file(file) as partial:
+        with whole_file(file, tidy=False) as partial:
             np.savez(partial, **flat)  # type: ignore[arg-type]
         return attempt + 1
     raise RuntimeError(
