@@ -153,7 +153,7 @@ def collect_episodes(
     remove_leftovers_in(root)
     files = [root / f"episode_{index:06d}.npz" for index in range(len(specs))]
     failures = {
-        index: load_episode(file)[1]["attempts"] - 1
+        index: _read_meta(file)["attempts"] - 1
         for index, file in enumerate(files)
         if file.exists()
     }
@@ -388,6 +388,11 @@ def _flat(arrays: EpisodeArrays, prefix: str = "") -> dict[str, NDArray[Any]]:
                 )
             flat[prefix + key] = array
     return flat
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    stored = read_npz(path, _WHAT, _AGAIN, names=[_META])
+    return _episode_meta(path, stored.get(_META))
 
 
 def _episode_meta(path: Path, stored: NDArray[Any] | None) -> dict[str, Any]:

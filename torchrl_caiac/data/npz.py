@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,11 @@ __all__ = ["read_npz"]
 
 
 def read_npz(
-    file: str | os.PathLike[str], what: str, remedy: str
+    file: str | os.PathLike[str],
+    what: str,
+    remedy: str,
+    *,
+    names: Collection[str] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Reads the arrays of a file that ``numpy.savez`` wrote.
 
@@ -28,6 +33,10 @@ def read_npz(
         file (path): the file.
         what (str): what the file is, for the error message.
         remedy (str): the end of the message, which says what to do.
+
+    Keyword Args:
+        names (collection of str, optional): the arrays to read. Defaults to ``None``:
+            all.
 
     Returns:
         dict of str to numpy.ndarray: the arrays.
@@ -52,7 +61,8 @@ def read_npz(
             for part in archive.infolist():
                 _check_header(archive, part)
         with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
+            wanted = [n for n in stored.files if names is None or n in names]
+            return {name: stored[name] for name in wanted}
     except Exception as error:  # zipfile and NumPy raise many kinds for damaged files
         raise UnreadableFileError(
             f"{path} is not a readable {what}, it may be truncated or damaged "
