@@ -282,5 +282,5 @@ def test_bad_sources():
     with pytest.raises(ValueError, match="7 of source 1 are not consecutive"):
         mix_trajectories([good, torch.cat([good, good[:2]])])
     named = source([2]).set("name", NonTensorData("expert", [2]))
-    with pytest.raises(ValueError, match=r"'name' of source 0 is not a tensor"):
+    with pytest.raises(ValueError, match=r"'name' of source 0 is a NonTensorData"):
         mix_trajectories([named])

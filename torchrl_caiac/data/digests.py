@@ -15,6 +15,7 @@ __all__ = [
     "data_digest",
     "data_source",
     "file_digest",
+    "has_digests",
     "verify_digests",
     "write_digests",
 ]
@@ -84,6 +85,23 @@ def write_digests(
         "source": None if source is None else dict(source),
     }
     write_json(folder / _FILE, content)
+
+
+def has_digests(folder: str | os.PathLike[str]) -> bool:
+    """Returns whether stored transitions have digests.
+
+    Args:
+        folder (path): the folder.
+
+    Returns:
+        bool: whether there is a ``digests.json``.
+
+    Examples:
+        >>> from torchrl_caiac.data.digests import has_digests
+        >>> has_digests("/missing")
+        False
+    """
+    return (Path(folder) / _FILE).exists()
 
 
 def verify_digests(folder: str | os.PathLike[str]) -> None:

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchrl_caiac._files import whole_folder
+from torchrl_caiac._files import UnreadableFileError, whole_folder
+from torchrl_caiac.data.minari_checks import check_metadata
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -103,6 +104,7 @@ def open_minari(
 
     Raises:
         FileNotFoundError: the dataset does not exist.
+        UnreadableFileError: its metadata are damaged, or would run code.
 
     Examples:
         >>> import tempfile
@@ -124,7 +126,14 @@ def open_minari(
             f"no Minari dataset {dataset_id!r} in {data.parent}: collect it first, "
             "pass download=True, or give its folder with root= or MINARI_DATASETS_PATH"
         )
-    return minari.MinariDataset(data)
+    check_metadata(data)
+    try:
+        return minari.MinariDataset(data)
+    except Exception as error:  # gymnasium and Minari raise many kinds
+        raise UnreadableFileError(
+            f"Minari cannot open {data} ({type(error).__name__}: {error}): download or "
+            "collect the dataset again"
+        ) from error
 
 
 @contextlib.contextmanager

@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 
 from torchrl_caiac._files import reserve, whole_folder
+from torchrl_caiac._keys import path as path_of
 from torchrl_caiac.data.action_bounds import write_action_bounds
 from torchrl_caiac.data.digests import write_digests
 from torchrl_caiac.data.load_transitions import load_transitions
 
-__all__ = ["check_free", "write_transitions"]
+__all__ = ["check_entries", "check_free", "write_transitions"]
+
+# Under these names, tensordict writes its own entries to meta.json.
+_RESERVED = {"_type", "device", "shape"}
 
 
 def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> None:
@@ -36,6 +40,36 @@ def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> 
             f"{path} exists: open it with load_transitions, or pass overwrite=True to "
             "replace it"
         )
+
+
+def check_entries(data: TensorDictBase, what: str = "the data") -> None:
+    """Raises if entries cannot be stored as transitions.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        what (str): the data's name in the error message. Defaults to ``"the data"``.
+
+    Raises:
+        ValueError: an entry is not a tensor, or has a name that tensordict's files
+            reserve.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.write_transitions import check_entries
+        >>> check_entries(TensorDict({"action": torch.zeros(3, 2)}, [3]))
+    """
+    for key, leaf in data.items(True, True, is_leaf=is_leaf_nontensor):
+        if not isinstance(leaf, torch.Tensor):
+            raise ValueError(
+                f"{key!r} of {what} is a {type(leaf).__name__}, expected a tensor: "
+                "leave it out with exclude()"
+            )
+        if _RESERVED & set(path_of(key)):
+            raise ValueError(
+                f"{key!r} of {what} has one of the names {sorted(_RESERVED)}, which "
+                "tensordict's files reserve: rename it"
+            )
 
 
 def write_transitions(
@@ -65,7 +99,8 @@ def write_transitions(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         OSError: the disk is full.
-        ValueError: ``action_bounds`` are not bounds of the actions.
+        ValueError: an entry is not a tensor or has a reserved name, or
+            ``action_bounds`` are not bounds of the actions.
 
     Examples:
         >>> import tempfile
@@ -85,6 +120,7 @@ def write_transitions(
         True
     """
     check_free(path, overwrite)
+    check_entries(data)
     if action_bounds is not None:
         _check_bounds(data, action_bounds)
     with whole_folder(path) as folder:
