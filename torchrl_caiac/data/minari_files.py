@@ -240,12 +240,11 @@ def publish_dataset(
     from minari import MinariDataset
     from tqdm import tqdm
 
-    target.parent.mkdir(parents=True, exist_ok=True)
     env = make_env()
     try:
-        with tempfile.TemporaryDirectory(
-            dir=target.parent, prefix=".partial-"
-        ) as partial:
+        with whole_folder(target) as made:
+            partial = made.parent / "minari"
+            partial.mkdir()
             bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
             with _datasets_in(partial):
                 minari.create_dataset_from_buffers(
@@ -260,13 +259,12 @@ def publish_dataset(
                     description=description,
                     requirements=list(requirements),
                 )
-            built = Path(partial) / dataset_id
+            built = partial / dataset_id
             # Minari stores the description of a namespace in a separate file.
             for extra in built.parent.iterdir():
                 if extra.is_file() and not (target.parent / extra.name).exists():
                     os.replace(extra, target.parent / extra.name)
-            with whole_folder(target) as made:
-                os.replace(built, made)
+            os.replace(built, made)
     finally:
         env.close()
     return MinariDataset(target / "data")
