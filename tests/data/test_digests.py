@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from tests.mutations import mutate_json
-from torchrl_caiac.data import UnreadableFileError
+from torchrl_caiac.data import UnreadableFileError, load_transitions
 from torchrl_caiac.data.digests import (
+    content_digests,
     data_digest,
     data_source,
     file_digest,
@@ -83,3 +84,44 @@ def test_damaged_digests_are_refused_by_name(tmp_path_factory, rng):
         verify_digests(folder)
     except UnreadableFileError as error:
         assert str(folder) in str(error)
+
+
+class TestContentDigests:
+    def test_only_original_leaves_and_named_scores_enter(self, tmp_path):
+        write_digests(stored(tmp_path))
+        rows = load_transitions(tmp_path, keys=["action"])
+        before = content_digests(rows)
+        assert before.keys() == {"action", "next.x"}
+        for key in (("caiac", "score"), ("oracle", "score")):
+            rows.make_memmap(key, shape=torch.Size([3, 2])).fill_(1.0)
+        assert content_digests(rows, ("coda", "graph"), None) == before
+        scored = content_digests(rows, ("caiac", "score"))
+        assert scored.keys() == {*before, "caiac.score"}
+        rows["oracle", "score"].fill_(2.0)
+        assert content_digests(rows, ("caiac", "score")) == scored
+        rows["caiac", "score"][1, 1] = 2.0
+        changed = content_digests(rows, ("caiac", "score"))
+        assert {key for key in scored if changed[key] != scored[key]} == {"caiac.score"}
+
+    def test_all_leaves_of_other_transitions_enter(self, tmp_path):
+        data = TensorDict({"action": torch.ones(3, 2), "x": torch.ones(3)}, [3])
+        one = content_digests(data)
+        assert one == content_digests(data.memmap(tmp_path))
+        assert one.keys() == {"action", "x"}
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda x: x.double(),
+            lambda x: x.view(200_000, 1),
+            lambda x: x.view(-1)[:-1],
+            lambda x: torch.cat([x.view(-1)[:-1], torch.zeros(1)]).view_as(x),
+        ],
+    )
+    def test_dtype_shape_and_every_number_count(self, change):
+        tensor = torch.arange(200_000.0).view(100_000, 2)
+        digests = [
+            content_digests(TensorDict({"a": value}))
+            for value in (tensor, tensor.clone(), change(tensor))
+        ]
+        assert digests[0] == digests[1] != digests[2]

@@ -9,9 +9,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+
 from torchrl_caiac._files import UnreadableFileError, read_json, write_json
+from torchrl_caiac._keys import path as path_of
+from torchrl_caiac._torchrl import memmap_folder
 
 __all__ = [
+    "content_digests",
     "data_digest",
     "data_source",
     "file_digest",
@@ -48,6 +55,57 @@ def file_digest(file: str | os.PathLike[str]) -> str:
     with open(file, "rb") as stream:
         while chunk := stream.read(_CHUNK):
             digest.update(chunk)
+    return digest.hexdigest()
+
+
+def content_digests(rows: TensorDictBase, *added: NestedKey | None) -> dict[str, str]:
+    """Returns digests of what is in transitions now.
+
+    Of opened transitions with a ``digests.json``, only the leaves that were written
+    together enter, and those of ``added`` that are there. Hence the result does not
+    change when scores of another kind are added. Of other transitions, all leaves
+    enter.
+
+    Args:
+        rows (TensorDictBase): the transitions, ``[T]``.
+        *added (NestedKey, optional): leaves that were added later and matter, such as
+            scores. ``None`` is left out.
+
+    Returns:
+        dict of str to str: hexadecimal SHA-256 by the key of the leaf, its parts joined
+        by dots.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.digests import content_digests
+        >>> rows = TensorDict({"next": {"done": torch.ones(3, 1)}}, [3])
+        >>> list(content_digests(rows))
+        ['next.done']
+    """
+    leaves = {path_of(key): leaf for key, leaf in rows.items(True, True)}
+    folder = memmap_folder(rows)
+    if folder is not None and has_digests(folder):
+        names = set(_read(Path(folder))["sha256"])
+        kept = {path_of(key) for key in added if key is not None}
+        leaves = {
+            key: leaf
+            for key, leaf in leaves.items()
+            if key in kept or _name(folder, leaf) in names
+        }
+    return {".".join(key): _tensor_digest(leaf) for key, leaf in leaves.items()}
+
+
+def _name(folder: str, leaf: torch.Tensor) -> str | None:
+    file = getattr(leaf, "filename", None)
+    return None if file is None else Path(file).relative_to(folder).as_posix()
+
+
+def _tensor_digest(tensor: torch.Tensor) -> str:
+    digest = hashlib.sha256(f"{tensor.dtype}{list(tensor.shape)}".encode())
+    for part in tensor.detach().split(1 << 16) if tensor.ndim else (tensor,):
+        flat = part.cpu().contiguous().reshape(-1)
+        digest.update(flat.view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
 
 
