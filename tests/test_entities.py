@@ -343,3 +343,19 @@ def test_repr_is_readable():
         "    cube0: observation[10:22], goal[0:3] mirrors observation[10:13]",
     ]
     assert "('observation', 'arm'), fixed" in repr(nested())
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.uint8, torch.int8, torch.int16, torch.int64, torch.bool]
+)
+def test_read_returns_numbers_whose_differences_do_not_wrap_around(dtype):
+    before, after = torch.tensor([[7, 1, 0], [6, 0, 1]]).to(dtype).split(1)
+    tree = {"observation": before, "next": {"observation": after}}
+    for layout, td in (
+        (EntityLayout({"arm": [0, 1, 2]}), TensorDict(tree, [1])),
+        (EntityLayout({"arm": [2, 0, 1]}), TensorDict(tree, [1])),
+        (EntityLayout.from_keys({"arm": "observation"}), TensorDict(tree, [1])),
+    ):
+        change = layout.read(td, next=True) - layout.read(td)
+        want = after.double() - before.double()
+        assert sorted(change.flatten().tolist()) == sorted(want.flatten().tolist())

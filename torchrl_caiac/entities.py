@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac import _columns
 from torchrl_caiac._files import UnreadableFileError, read_json, write_json
-from torchrl_caiac._keys import as_key, join
+from torchrl_caiac._keys import as_key, floating, join
 from torchrl_caiac._layout_format import layout_arguments, layout_text, layout_to_dict
 from torchrl_caiac._layout_reading import (
     check_data,
@@ -329,8 +329,10 @@ class EntityLayout:
             next (bool): read the next state. Defaults to ``False``.
 
         Returns:
-            torch.Tensor: ``[*B, W]``, where ``W`` is the sum of the widths. It may
-            share memory with ``td``: do not write to it.
+            torch.Tensor: ``[*B, W]``, where ``W`` is the sum of the widths. Integers
+            and booleans become floating point, float64 if they have more than 16
+            bits, so that differences do not wrap around. The tensor may share memory
+            with ``td``: do not write to it.
 
         Raises:
             KeyError: a key is missing.
@@ -349,9 +351,10 @@ class EntityLayout:
             return torch.cat(list(read_entities(self, td, next=next).values()), -1)
         observation = read_observation(self, td, next=next)
         columns = [c for columns in self.columns.values() for c in columns]
-        if columns == list(range(observation.shape[-1])):
-            return observation
-        return observation[..., self.index_tensor("read", columns, observation.device)]
+        if columns != list(range(observation.shape[-1])):
+            where = self.index_tensor("read", columns, observation.device)
+            observation = observation[..., where]
+        return floating(observation)
 
     def achieved_goal(self, td: TensorDictBase, *, next: bool = False) -> torch.Tensor:
         """Returns the goal that a state achieves (flat layouts only).

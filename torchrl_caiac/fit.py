@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from tqdm.auto import tqdm
 
-from torchrl_caiac._keys import as_key, get_leaf, jsonable
+from torchrl_caiac._keys import as_key, floating, get_leaf, jsonable
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 from torchrl_caiac.trajectories import trajectory_index
@@ -285,9 +285,9 @@ class _Rows:
         # The change is computed before the cast, to keep small changes of float64 data.
         state, action, after = state.cpu(), action.cpu(), after.cpu()
         index = self.model.index.cpu()
-        raw = after[:, index]
+        raw = floating(after[:, index])
         if self.model.target == "change":
-            raw = raw - state[:, index]
+            raw = raw - floating(state[:, index])
         return torch.cat([state.float(), action.float(), raw.float()], 1)
 
     def get(self, index: torch.Tensor) -> tuple[torch.Tensor, ...]:

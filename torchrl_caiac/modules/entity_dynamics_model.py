@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_caiac._keys import as_key, jsonable, key_from_json
+from torchrl_caiac._keys import as_key, floating, jsonable, key_from_json
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._predicted_columns import (
     checked_floor,
@@ -247,8 +247,10 @@ class EntityDynamicsModel(TensorDictModuleBase):
         Returns:
             torch.Tensor: ``[*B, P]``.
         """
-        after = next_state[..., self.index]
-        return after - state[..., self.index] if self.target == "change" else after
+        after = floating(next_state[..., self.index])
+        if self.target != "change":
+            return after
+        return after - floating(state[..., self.index])
 
     def normalise(self, raw: torch.Tensor) -> torch.Tensor:
         """Normalises raw targets, in the dtype of the parameters.
@@ -263,6 +265,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
             RuntimeError: :meth:`fit_statistics` was not called.
         """
         self._check_fitted()
+        raw = floating(raw)
         loc, scale = (x.to(raw.dtype) for x in (self.target_loc, self.target_scale))
         return ((raw - loc) / scale).to(self.dtype)
 
@@ -281,7 +284,9 @@ class EntityDynamicsModel(TensorDictModuleBase):
         """
         self._check_fitted()
         raw = loc * self.target_scale.to(loc.dtype) + self.target_loc.to(loc.dtype)
-        return raw + state[..., self.index] if self.target == "change" else raw
+        if self.target != "change":
+            return raw
+        return raw + floating(state[..., self.index])
 
     def targets(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Returns the normalised targets of transitions.
