@@ -21,14 +21,18 @@ from torchrl_caiac.transforms.checks import (
     check_generator,
     check_layout,
     check_number,
-    check_reward_fn,
     check_window,
 )
 from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.draws import SwapDraw
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
-from torchrl_caiac.transforms.rewards import RewardFn, recompute_reward
+from torchrl_caiac.transforms.rewards import (
+    GoalLeaves,
+    RewardFn,
+    TerminatedFn,
+    goal_vectors,
+)
 from torchrl_caiac.transforms.swap import SwapPlan, SwapPlanner, apply_swap
 
 __all__ = ["CounterfactualTransform"]
@@ -56,6 +60,7 @@ class CounterfactualTransform(BufferTransform, ABC):
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
         score_key (NestedKey): the scores.
         reward_fn (callable, optional): recomputes rewards of counterfactual rows.
+        terminated_fn (callable, optional): recomputes their end flags.
         goals (WindowGoal, optional): draws the goals of donor windows.
         generator (torch.Generator, optional): source of randomness.
         keys (TransformKeys, optional): the other keys.
@@ -78,6 +83,7 @@ class CounterfactualTransform(BufferTransform, ABC):
         donors: ReplayBuffer | TensorStorage | None,
         score_key: NestedKey,
         reward_fn: RewardFn | None,
+        terminated_fn: TerminatedFn | None = None,
         goals: WindowGoal | None,
         generator: torch.Generator | None,
         keys: TransformKeys | None,
@@ -92,10 +98,12 @@ class CounterfactualTransform(BufferTransform, ABC):
         self.swap_prob = check_number("swap_prob", swap_prob, 1.0)
         self.window = check_window(window)
         self.score_key = as_key(score_key)
-        self.reward_fn = None if reward_fn is None else check_reward_fn(reward_fn)
         self.generator = check_generator(generator)
         self.keys = keys or TransformKeys()
         self.check = bool(check)
+        self._goal_leaves = GoalLeaves(
+            reward_fn, terminated_fn, keys=self.keys, check=self.check
+        )
         if goals is not None:
             self._check_goals(goals, donors)
         # In a tuple, so that torch does not register the goals as a submodule.
@@ -122,11 +130,10 @@ class CounterfactualTransform(BufferTransform, ABC):
         )
         self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
         swapped = self._planner.keys
-        rewards = [] if reward_fn is None else [self.keys.reward]
-        self.in_keys = [*swapped, self.score_key, *rewards]
+        self.in_keys = [*swapped, self.score_key, *self._goal_leaves.in_keys]
         self.out_keys = [
             *swapped,
-            *rewards,
+            *self._goal_leaves.out_keys,
             self.keys.counterfactual,
             self.keys.swapped,
         ]
@@ -166,6 +173,16 @@ class CounterfactualTransform(BufferTransform, ABC):
         """
 
     # --- settings and state ----------------------------------------------------------
+
+    @property
+    def reward_fn(self) -> RewardFn | None:
+        """The function that recomputes rewards."""
+        return self._goal_leaves.reward_fn
+
+    @property
+    def terminated_fn(self) -> TerminatedFn | None:
+        """The function that recomputes end flags."""
+        return self._goal_leaves.terminated_fn
 
     @property
     def donors(self) -> ReplayBuffer | TensorStorage | None:
@@ -277,11 +294,12 @@ class CounterfactualTransform(BufferTransform, ABC):
             out = apply_swap(td, plan, values, draw, window=self.window)
         keys, swapped = self.keys, draw.swapped
         total, changed = td.shape[0], swapped.shape[0] * self.window
-        if self.reward_fn is not None and changed:
-            reward = recompute_reward(
-                out, self.layout, self.reward_fn, changed, reward_key=keys.reward
-            )
-            out.set(keys.reward, reward)
+        if self._goal_leaves and changed:
+            first = total - changed
+            achieved, desired = goal_vectors(out, self.layout, first)
+            leaves = self._goal_leaves(out, achieved, desired, first=first)
+            for key, leaf in leaves.items():
+                out.set(key, leaf)
         if self.window > 1:
             swapped = swapped.unsqueeze(1).expand(-1, self.window, -1).flatten(0, 1)
         kept = swapped.new_zeros(total - changed, swapped.shape[-1])
