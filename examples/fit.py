@@ -86,6 +86,7 @@ def fit_model(cfg: DictConfig, name: str) -> Any:
     history = fit_world_model(
         model,
         rows,
+        action_spec=environment.action_spec,
         steps=settings.steps,
         batch_size=settings.batch_size,
         lr=settings.lr,
