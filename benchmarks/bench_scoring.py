@@ -32,7 +32,7 @@ from typing import Any, Literal
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data import Bounded, ReplayBuffer, TensorStorage
 
 from benchmarks.ratios import seconds
 from torchrl_caiac.data import load_minari, mix_trajectories
@@ -88,6 +88,7 @@ def kitchen_model() -> GaussianWorldModel:
     return GaussianWorldModel(KitchenEnv.layout, 9, (256,) * 5, variance_floor=2e-3)
 
 
+ACTIONS = {size: Bounded(-1.0, 1.0, (size,)) for size in (4, 9)}
 MODELS = pytest.mark.parametrize("make", [fetch_model, kitchen_model])
 
 
@@ -108,13 +109,22 @@ def fitted(name: str) -> Shape:
                 )
             ]
             data, model = mix_trajectories(parts), fetch_model()
-            fit_world_model(model, data, steps=2000, progress=False)
+            fit_world_model(
+                model, data, action_spec=ACTIONS[4], steps=2000, progress=False
+            )
             return Shape(model, data["observation"].clone(), 0.05, 3)
         dataset, _ = create_kitchen_play(episodes=2, **options)
         random = create_kitchen_random(dataset, ratio=1.0, **options)
         data, more = (kitchen_transitions(d, progress=False) for d in (dataset, random))
         model = kitchen_model()
-        fit_world_model(model, [data, more], lr=8e-4, steps=2000, progress=False)
+        fit_world_model(
+            model,
+            [data, more],
+            action_spec=ACTIONS[9],
+            lr=8e-4,
+            steps=2000,
+            progress=False,
+        )
         return Shape(model, data["observation"].clone(), 0.2, 1)
 
 
@@ -278,6 +288,8 @@ torch.set_num_threads(1)
 def score(rows, entities, actions, hidden, **options):
     layout = EntityLayout({f"e{i}": [2 * i, 2 * i + 1] for i in range(entities)})
     model = GaussianWorldModel(layout, 2, (hidden,))
+    model.fit_statistics(torch.ones(1, model.predict_dim))
+    model.set_action_bounds(-1.0, 1.0)
     td = TensorDict({"observation": torch.zeros(rows, 2 * entities)}, [rows])
     CAI(model, actions, **options)(td)
 
@@ -329,7 +341,10 @@ def bench_memory(
 def bench_growth(benchmark: Any, judge: Callable[..., None], tmp_path: Path) -> None:
     """Rows of a memmap, with a small model: the cost per row must not grow."""
     layout = EntityLayout({"arm": range(2), "cup": range(2, 4)})
-    estimator = CAI(GaussianWorldModel(layout, 2, (16,)), 8, compile=True)
+    model = GaussianWorldModel(layout, 2, (16,))
+    model.fit_statistics(torch.ones(1, model.predict_dim))
+    model.set_action_bounds(-1.0, 1.0)
+    estimator = CAI(model, 8, compile=True)
     micros = {}
     for rows in (10_000, 100_000, 1_000_000):
         episode = torch.arange(rows) // 100

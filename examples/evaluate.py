@@ -14,10 +14,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from environments.base import Evaluation
 from shared.console import progress_bar, start
-from shared.parts import make_environment, policy_steps, run_folder
+from shared.parts import make_environment, policy_file, policy_steps, run_folder
 from shared.settings import keep_settings
 from torchrl_caiac._files import write_json
-from train import load_policy
+from torchrl_caiac.data.digests import file_digest
+from train import check_run, load_policy
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -26,6 +27,7 @@ def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
     """Evaluates the saved policies of one run.
 
     The results are saved in ``evaluation/<step>.json``; existing ones are not repeated.
+    They are refused if the run, or the policy, is another one by now.
     """
     environment = make_environment(cfg)
     folder = run_folder(cfg, method, seed) / "evaluation"
@@ -33,6 +35,7 @@ def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
     for name in ("last", "curve_every"):  # which policies, not what they do
         kept.pop(name)
     keep_settings(folder, "evaluate", kept)
+    check_run(cfg, method, seed)
     evaluations = []
     steps = policy_steps(cfg)
     bar = progress_bar(
@@ -41,6 +44,10 @@ def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
     with bar:
         for step in steps:
             path = folder / f"{step}.json"
+            policy = policy_file(cfg, method, seed, step)
+            if policy.exists():
+                played = {"sha256": file_digest(policy)}
+                keep_settings(folder, f"policy-{step}", played)
             if not path.exists():
                 actor = load_policy(cfg, method, seed, step)
                 write_json(path, environment.play(actor, seed, folder))

@@ -15,13 +15,14 @@ from typing import Any
 
 import hydra
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from environments.base import Environment
 from shared.console import progress, start
 from shared.parts import make_environment, make_methods
 from shared.settings import keep_settings
 from torchrl_caiac._files import write_json
+from torchrl_caiac.data.digests import content_digests
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 
@@ -70,7 +71,13 @@ def fit_model(cfg: DictConfig, name: str) -> Any:
     """
     environment, settings = make_environment(cfg), cfg.env[name]
     folder = environment.folder
-    keep_settings(folder, name, settings)
+    rows = environment.model_rows()
+    kept: dict[str, Any] = {
+        **OmegaConf.to_container(settings, resolve=True),
+        "layout": environment.layout.to_dict(),
+        "data": {str(i): content_digests(part) for i, part in enumerate(rows)},
+    }
+    keep_settings(folder, name, kept)
     torch.manual_seed(settings.seed)
     model = MAKERS[name](environment, settings)
     checkpoint = folder / name
@@ -78,7 +85,8 @@ def fit_model(cfg: DictConfig, name: str) -> Any:
     begin = time.process_time()
     history = fit_world_model(
         model,
-        environment.model_rows(),
+        rows,
+        action_spec=environment.action_spec,
         steps=settings.steps,
         batch_size=settings.batch_size,
         lr=settings.lr,

@@ -23,6 +23,7 @@ from shared.parts import make_environment, make_methods
 from shared.settings import keep_settings
 from torchrl_caiac._files import whole_file, write_json
 from torchrl_caiac.data import offline_buffer
+from torchrl_caiac.data.digests import content_digests
 from torchrl_caiac.influence import influence_report, score_buffer
 
 _LOGGER = logging.getLogger(__name__)
@@ -44,9 +45,16 @@ def score(cfg: DictConfig) -> dict[str, Any]:
     """
     scoring = make_scoring(cfg)
     environment, settings = scoring.environment, scoring.settings
-    for step, values in (("score", settings), ("truth", cfg.env.truth)):
+    for step, values, rows in (
+        ("score", settings, environment.rows()),
+        ("truth", cfg.env.truth, environment.held_out()),
+    ):
         kept: dict[str, Any] = OmegaConf.to_container(values)
         kept.pop("batch_size")  # changes no result
+        kept |= {
+            "layout": environment.layout.to_dict(),
+            "data": content_digests(rows),
+        }
         keep_settings(environment.folder, step, kept)
     rb = offline_buffer(environment.rows(), batch_size=1)
     methods = {str(method.score_key): method for method in make_methods(cfg).values()}

@@ -13,12 +13,12 @@ from typing import Any
 import hydra
 import torch
 from omegaconf import DictConfig
-from torchrl.record.loggers import get_logger
 
 from learners.base import Learner
 from shared.console import progress_bar, start
+from shared.log import ScalarLog
 from shared.parts import make_learner, policy_file, run_folder
-from shared.settings import keep_settings
+from shared.settings import check_settings, keep_settings
 from torchrl_caiac._files import whole_file
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 
@@ -30,16 +30,18 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
     settings = cfg.learner
     folder = run_folder(cfg, method, seed)
     learner = make_learner(cfg, method)
-    keep_settings(folder, "train", learner.kept_settings())
+    kept = learner.kept_settings(seed)
+    keep_settings(folder, "train", kept)
     learner.setup(learner.rows(), seed)
-    checkpoint = TrainingCheckpoint(folder / "checkpoint.zip", **learner.parts)
+    log = ScalarLog(settings.logger, folder)
+    checkpoint = TrainingCheckpoint(
+        folder / "checkpoint.zip", settings=kept, log=log, **learner.parts
+    )
     step = checkpoint.load()
+    log.resume(step)
     if step:
         _LOGGER.info("%s resumes at step %d", folder.name, step)
-    logger = get_logger(settings.logger, str(folder), "log")
     batches = learner.batches()
-    sums: dict[str, torch.Tensor] = {}
-    summed = 0  # fewer than log_every if a run resumes between two logs
     bar = progress_bar(
         total=settings.steps, initial=step, desc=folder.name, unit="step"
     )
@@ -48,14 +50,10 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
     try:
         while step < settings.steps:
             step += 1
-            for key, value in learner.step(next(batches), step).items():
-                sums[key] = sums.get(key, 0.0) + value
-            summed += 1
+            log.add(learner.step(next(batches), step))
             bar.update()
             if step % settings.log_every == 0:
-                for key, value in sums.items():
-                    logger.log_scalar(key, value.item() / summed, step=step)
-                sums, summed = {}, 0
+                log.write(step)
             if step % (settings.keep_every or settings.steps) == 0:
                 with whole_file(policy_file(cfg, method, seed, step)) as partial:
                     torch.save(learner.policy_state(), partial)
@@ -67,8 +65,20 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
     return learner
 
 
+def check_run(cfg: DictConfig, method: str, seed: int) -> None:
+    """Raises if a run was not begun, or with other settings, data or scores."""
+    kept = make_learner(cfg, method).kept_settings(seed)
+    check_settings(run_folder(cfg, method, seed), "train", kept)
+
+
 def load_policy(cfg: DictConfig, method: str, seed: int, step: int) -> Any:
-    """Returns the policy of a run after some steps."""
+    """Returns the policy of a run after some steps.
+
+    Raises:
+        FileNotFoundError: the run has not come so far.
+        ValueError: the run has other settings or data, or the file is damaged.
+    """
+    check_run(cfg, method, seed)
     path = policy_file(cfg, method, seed, step)
     learner = make_learner(cfg, method)
     try:

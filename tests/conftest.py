@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import errno
+import os
+import shutil
+import subprocess
+import types
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -32,6 +37,50 @@ def cuda(request: pytest.FixtureRequest) -> Iterator[None]:
         pretend_cuda() if is_needed and not torch.cuda.is_available() else nullcontext()
     ):
         yield
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on a disk of 4 MB, a stand-in where none can be mounted."""
+    folder, size = tmp_path / "small_disk", 4 << 20
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if (
+        shutil.which("mount")
+        and not subprocess.run(mount, capture_output=True).returncode
+    ):
+        yield folder
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+        return
+
+    def allocate(descriptor: int, offset: int, nbytes: int) -> None:
+        if offset + nbytes > size:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", allocate)
+    free = types.SimpleNamespace(f_bavail=size, f_frsize=1)
+    monkeypatch.setattr(os, "fstatvfs", lambda descriptor: free)
+    yield folder
+
+
+@pytest.fixture
+def read_only() -> Iterator[Callable[[Path], None]]:
+    """A function that makes a folder read-only until the test ends, also for root."""
+    mounted: list[Path] = []
+
+    def protect(folder: Path) -> None:
+        if os.geteuid():
+            for path in (folder, *folder.rglob("*")):
+                path.chmod(path.stat().st_mode & ~0o222)
+        else:
+            subprocess.run(["mount", "--bind", folder, folder], check=True)
+            mounted.append(folder)
+            remount = ["mount", "-o", "remount,ro,bind", folder]
+            subprocess.run(remount, check=True)
+
+    yield protect
+    for folder in mounted:
+        subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 @pytest.fixture

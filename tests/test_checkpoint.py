@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 import tensordict
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
+from tests.killing import run_killed
+from tests.mutations import mutate_file
 from torchrl_caiac.checkpoint import TrainingCheckpoint
+from torchrl_caiac.data import UnreadableFileError
 
 
 class Run:
@@ -115,15 +120,92 @@ class TestTrainingCheckpoint:
     def test_leftovers_of_interrupted_writes_are_removed(self, tmp_path):
         run = Run(tmp_path / "checkpoint.zip", seed=1)
         run.checkpoint.save(1)
-        (tmp_path / ".partial-12-checkpoint.zip").write_text("half")
-        (tmp_path / "..partial-12-checkpoint.zip.archive-0f").write_text("half")
-        (tmp_path / "..partial-12-checkpoint.zip.stage-0f").mkdir()
-        (tmp_path / "..partial-12-checkpoint.zip.stage-0f" / "x").write_text("half")
+
+        def save(**_):
+            checkpoint_save = Checkpoint.save
+
+            def killed(self, *args, **kwargs):
+                checkpoint_save(self, *args, **kwargs)
+                os.kill(os.getpid(), 9)
+
+            Checkpoint.save = killed
+            run.checkpoint.save(2)
+            yield
+
+        run_killed(save)
+        assert len(list(tmp_path.iterdir())) == 2
         others = {".partial-12-other-checkpoint.zip", "a.partial-12-checkpoint.zip"}
         for name in others:
             (tmp_path / name).touch()
         assert run.checkpoint.load() == 1
         assert {p.name for p in tmp_path.iterdir()} == {"checkpoint.zip", *others}
+
+    def test_runs_that_do_the_same_write_the_same_bytes(self, tmp_path):
+        for name in ("one.zip", "other.zip"):
+            run = Run(tmp_path / name, seed=1, settings={"lr": 0.1})
+            run.step()
+            run.checkpoint.save(1)
+        contents = [(tmp_path / n).read_bytes() for n in ("one.zip", "other.zip")]
+        assert contents[0] == contents[1]
+        with zipfile.ZipFile(tmp_path / "one.zip") as archive:
+            assert {info.date_time[0] for info in archive.infolist()} == {1980}
+        # It is an archive that TorchRL reads.
+        assert Checkpoint.manifest(tmp_path / "one.zip")["metadata"]["step"] == 1
+
+    def test_a_read_only_folder_is_read(self, tmp_path, read_only):
+        path = tmp_path / "run" / "checkpoint.zip"
+        Run(path, seed=1).checkpoint.save(3)
+        read_only(path.parent)
+        assert Run(path, seed=2).checkpoint.load() == 3
+
+    def test_a_compressed_file_is_refused(self, tmp_path):
+        path = tmp_path / "checkpoint.zip"
+        run = Run(path, seed=1)
+        run.checkpoint.save(1)
+        with (
+            zipfile.ZipFile(path) as source,
+            zipfile.ZipFile(tmp_path / "bomb", "w", zipfile.ZIP_DEFLATED) as target,
+        ):
+            for info in source.infolist():
+                target.writestr(info.filename, source.read(info))
+        os.replace(tmp_path / "bomb", path)
+        with pytest.raises(UnreadableFileError, match=r"manifest\.json.* compressed"):
+            run.checkpoint.load()
+
+    @settings(max_examples=150)
+    @given(st.randoms(use_true_random=False))
+    def test_a_damaged_file_changes_nothing(self, tmp_path_factory, rng):
+        path = tmp_path_factory.mktemp("damaged") / "checkpoint.zip"
+        saved = Run(path, seed=1)
+        saved.step()
+        saved.checkpoint.save(1)
+        mutate_file(path, rng)
+        run = Run(path, seed=2)
+        before = run.everything()
+        try:
+            step = run.checkpoint.load()
+        except UnreadableFileError as error:
+            assert str(path) in str(error)
+            assert run.everything() == before
+        else:
+            assert step == int(path.exists())
+
+    def test_parts_are_restored_even_if_one_cannot_be(self, tmp_path, monkeypatch):
+        path = tmp_path / "checkpoint.zip"
+        saved = Run(path, seed=1)
+        saved.step()
+        saved.checkpoint.save(1)
+        run = Run(path, seed=2)
+        before = repr(copy.deepcopy(run.model.state_dict()))
+
+        def refuse(state):
+            raise RuntimeError("never again")
+
+        monkeypatch.setattr(run.scheduler, "load_state_dict", refuse)
+        with pytest.raises(UnreadableFileError, match="never again"):
+            run.checkpoint.load()
+        assert repr(run.model.state_dict()) == before
+        assert not run.optimizer.state_dict()["state"]
 
     def test_without_generators(self, tmp_path):
         run = Run(tmp_path / "checkpoint.zip", seed=1, rng=False)

@@ -2,16 +2,21 @@ from __future__ import annotations
 
 import copy
 import json
+import traceback
 from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+import torchrl_caiac
+from tests.mutations import mutate_file, mutate_json
 from torchrl_caiac import EntityLayout
+from torchrl_caiac.data import UnreadableFileError
 
+PACKAGE = str(Path(torchrl_caiac.__file__).parent)
 GOAL = {"cube0": range(3), "cube1": range(3, 6)}
 ACHIEVED = {"cube0": range(10, 13), "cube1": range(22, 25)}
 
@@ -275,6 +280,47 @@ class TestSaving:
         with pytest.raises(ValueError, match=r"layout\.json"):
             EntityLayout.load(path)
 
+    @settings(max_examples=500)
+    @given(st.sampled_from([fetch(), nested()]), st.randoms(use_true_random=False))
+    def test_a_damaged_dict_is_a_layout_or_one_error(self, layout, rng):
+        content = mutate_json(layout.to_dict(), rng)
+        try:
+            found = EntityLayout.from_dict(content)
+        except (ValueError, TypeError) as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            assert frames[-1].filename.startswith(PACKAGE)
+            assert len(str(error)) > 20
+        else:
+            assert len(found.names) == len(content["entities"])
+            assert found == EntityLayout.from_dict(found.to_dict())
+            repr(found)
+
+    def test_each_unknown_and_doubled_part_is_named(self):
+        content = fetch().to_dict()
+        for change, match in (
+            ({"fixd": []}, "fixd"),
+            ({"entities": [["a", [0]], ["a", [1]]]}, r"each name once.*'a', 'a'"),
+            ({"entities": [["a", [2**31]]]}, "columns from 0 to 2147483647"),
+            ({"flat": 1}, "flat of the layout: expected true or false, got 1"),
+            ({"next_key": []}, "next_key"),
+        ):
+            with pytest.raises(ValueError, match=match):
+                EntityLayout.from_dict(content | change)
+
+    def test_text_of_far_columns_takes_no_memory(self):
+        assert "[0, 1000000000]" in repr(EntityLayout({"a": [0, 10**9]}))
+
+    @settings(max_examples=200)
+    @given(st.randoms(use_true_random=False))
+    def test_a_damaged_file_is_a_layout_or_one_error(self, tmp_path_factory, rng):
+        path = tmp_path_factory.mktemp("damaged") / "layout.json"
+        nested().save(path)
+        mutate_file(path, rng)
+        try:
+            EntityLayout.load(path)
+        except (UnreadableFileError, FileNotFoundError) as error:
+            assert str(path) in str(error)
+
     def test_nothing_half_written(self, tmp_path, monkeypatch):
         path = tmp_path / "layout.json"
         nested().save(path)
@@ -297,3 +343,19 @@ def test_repr_is_readable():
         "    cube0: observation[10:22], goal[0:3] mirrors observation[10:13]",
     ]
     assert "('observation', 'arm'), fixed" in repr(nested())
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.uint8, torch.int8, torch.int16, torch.int64, torch.bool]
+)
+def test_read_returns_numbers_whose_differences_do_not_wrap_around(dtype):
+    before, after = torch.tensor([[7, 1, 0], [6, 0, 1]]).to(dtype).split(1)
+    tree = {"observation": before, "next": {"observation": after}}
+    for layout, td in (
+        (EntityLayout({"arm": [0, 1, 2]}), TensorDict(tree, [1])),
+        (EntityLayout({"arm": [2, 0, 1]}), TensorDict(tree, [1])),
+        (EntityLayout.from_keys({"arm": "observation"}), TensorDict(tree, [1])),
+    ):
+        change = layout.read(td, next=True) - layout.read(td)
+        want = after.double() - before.double()
+        assert sorted(change.flatten().tolist()) == sorted(want.flatten().tolist())

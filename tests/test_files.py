@@ -1,58 +1,25 @@
-"""Files and folders are whole or not there, and have one writer."""
+"""Files are checked when they are read, have their space, and one writer."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
-import stat
+from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 
 from torchrl_caiac._files import (
+    UnreadableFileError,
     claim_folder,
-    remove_leftovers,
-    whole_file,
-    whole_folder,
+    recover_meta,
+    reserve,
+    safe_meta,
     write_json,
 )
-
-
-class TestWholeFile:
-    def test_takes_its_place_at_the_end(self, tmp_path):
-        path = tmp_path / "new" / "folder" / "figure.png"
-        with whole_file(path) as partial:
-            assert partial.suffix == ".png"
-            partial.write_text("first")
-            assert not path.exists()
-        assert path.read_text() == "first"
-        with whole_file(str(path)) as partial:
-            partial.write_text("second")
-            assert path.read_text() == "first"
-        assert path.read_text() == "second"
-        assert list(path.parent.iterdir()) == [path]
-
-    def test_errors_leave_the_old_file(self, tmp_path):
-        path = tmp_path / "table.txt"
-        path.write_text("old")
-        with pytest.raises(KeyboardInterrupt), whole_file(path) as partial:
-            partial.write_text("ne")
-            raise KeyboardInterrupt
-        with pytest.raises(FileNotFoundError), whole_file(path):
-            pass  # nothing is written
-        assert path.read_text() == "old"
-        assert list(tmp_path.iterdir()) == [path]
-
-    def test_leftovers_of_interrupted_writes_are_removed(self, tmp_path):
-        path = tmp_path / "table.txt"
-        remove_leftovers(tmp_path / "missing" / "table.txt")
-        writes = [whole_file(tmp_path / name) for name in ("table.txt", "other.txt")]
-        for write in writes:
-            write.__enter__().write_text("half")  # and never leaves
-        assert len(list(tmp_path.iterdir())) == 2
-        remove_leftovers(path)
-        (left,) = tmp_path.iterdir()
-        assert left.name.endswith("other.txt")
 
 
 class TestWriteJson:
@@ -78,35 +45,6 @@ class TestWriteJson:
         assert len(list(tmp_path.iterdir())) == 1
 
 
-class TestWholeFolder:
-    def test_what_raises_leaves_the_old_folder(self, tmp_path):
-        path = tmp_path / "a" / "data"
-        for text in ("old", "new"):
-            with whole_folder(path) as partial:
-                partial.mkdir()
-                (partial / "x").write_text(text)
-        with pytest.raises(RuntimeError), whole_folder(path) as partial:
-            partial.mkdir()
-            (partial / "x").write_text("half")
-            raise RuntimeError
-        with pytest.raises(FileNotFoundError), whole_folder(path):
-            pass  # nothing was made: what is there stays
-        assert (path / "x").read_text() == "new"
-        assert list(path.parent.iterdir()) == [path]
-
-
-def test_modes_follow_the_umask(tmp_path):
-    previous = os.umask(0o022)
-    try:
-        write_json(tmp_path / "a.json", 1)
-        with whole_folder(tmp_path / "folder") as partial:
-            partial.mkdir()
-    finally:
-        os.umask(previous)
-    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o644
-    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o755
-
-
 def test_a_folder_is_claimed_once(tmp_path):
     folder = tmp_path / "new" / "folder"
     for _ in range(2):
@@ -122,3 +60,95 @@ def test_a_folder_is_claimed_once(tmp_path):
         raise KeyError
     with claim_folder(folder):
         pass
+
+
+def stored(folder: Path) -> TensorDict:
+    rows = TensorDict({"action": torch.ones(3, 2), "next": {"x": torch.ones(3)}}, [3])
+    return rows.memmap(folder)
+
+
+class TestReserve:
+    def test_files_get_their_blocks_and_keep_their_content(self, tmp_path):
+        file = tmp_path / "leaf.memmap"
+        file.write_bytes(b"abc")
+        reserve(file, 1 << 20)
+        assert file.stat().st_blocks * 512 >= file.stat().st_size == 1 << 20
+        assert file.read_bytes()[:4] == b"abc\0"
+        reserve(file, 2)
+        assert file.read_bytes() == b"ab"
+
+    def test_all_sparse_files_of_a_folder(self, tmp_path):
+        rows = TensorDict({"a": torch.zeros(1), "b": {"c": torch.zeros(1)}}, [1])
+        rows.expand(1 << 18).memmap_like(tmp_path)
+        files = sorted(tmp_path.rglob("*.memmap"))
+        assert all(f.stat().st_blocks * 512 < f.stat().st_size for f in files)
+        reserve(tmp_path)
+        assert all(f.stat().st_blocks * 512 >= f.stat().st_size > 0 for f in files)
+
+    def test_a_full_disk_is_an_error_that_names_file_and_sizes(self, small_disk):
+        old, new = small_disk / "old.memmap", small_disk / "new.memmap"
+        old.write_bytes(b"abc")
+        for file in (old, new):
+            with pytest.raises(OSError, match=r"(?s)8388608 bytes, \d+ are free") as e:
+                reserve(file, 8 << 20)
+            assert e.value.errno == errno.ENOSPC and str(file) in str(e.value)
+        assert old.read_bytes() == b"abc" and not new.exists()
+
+    def test_where_space_cannot_be_reserved_the_free_space_decides(
+        self, small_disk, monkeypatch
+    ):
+        monkeypatch.delattr(os, "posix_fallocate")
+        reserve(small_disk / "fits.memmap", 1 << 20)
+        with pytest.raises(OSError, match="the disk is full"):
+            reserve(small_disk / "large.memmap", 8 << 20)
+
+    def test_other_errors_are_not_hidden(self, tmp_path):
+        with pytest.raises(FileNotFoundError):
+            reserve(tmp_path / "missing" / "leaf.memmap", 1)
+
+
+class TestSafeMeta:
+    def test_leaves_no_copies(self, tmp_path):
+        rows = stored(tmp_path)
+        before = sorted(tmp_path.rglob("*"))
+        with safe_meta(tmp_path):
+            assert len(list(tmp_path.rglob("*.bak"))) == 2
+        assert sorted(tmp_path.rglob("*")) == before
+        with safe_meta(tmp_path):
+            rows.make_memmap(("next", "y"), shape=torch.Size([3]))
+        loaded = TensorDict.load_memmap(tmp_path)
+        assert ("next", "y") in loaded.keys(True)
+
+    @pytest.mark.parametrize("emptied", ["meta.json", "next/meta.json"])
+    @pytest.mark.parametrize("key", ["y", ("next", "y"), ("new", "y")])
+    def test_a_killed_addition_is_undone(self, tmp_path, key, emptied):
+        rows = stored(tmp_path)
+        kept = {f: f.read_bytes() for f in tmp_path.rglob("meta.json")}
+        guard = safe_meta(tmp_path)
+        guard.__enter__()  # and never leaves, as in a killed process
+        rows.make_memmap(key, shape=torch.Size([3]))
+        (tmp_path / emptied).write_text("")
+        assert recover_meta(tmp_path)
+        assert {f: f.read_bytes() for f in kept} == kept
+        assert set(TensorDict.load_memmap(tmp_path).keys()) == {"action", "next"}
+        assert not recover_meta(tmp_path)
+
+    def test_an_error_restores_at_once(self, tmp_path):
+        stored(tmp_path)
+        kept = (tmp_path / "meta.json").read_text()
+        with pytest.raises(OSError, match="full"), safe_meta(tmp_path):
+            (tmp_path / "meta.json").write_text("")
+            raise OSError("full")
+        assert (tmp_path / "meta.json").read_text() == kept
+        assert not list(tmp_path.rglob("*.bak"))
+
+    def test_damage_without_a_copy_is_an_error(self, tmp_path):
+        stored(tmp_path)
+        (tmp_path / "next" / "meta.json").write_text("{")
+        assert not recover_meta(tmp_path)
+        with (
+            pytest.raises(UnreadableFileError, match=r"next/meta\.json is damaged"),
+            safe_meta(tmp_path),
+        ):
+            pass
+        assert not list(tmp_path.rglob("*.bak"))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Bounded, Unbounded
 
 import torchrl_caiac.fit as module
+from torchrl_caiac.data.write_transitions import write_transitions
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence.cai import CAI
@@ -54,8 +58,12 @@ def assert_equal(a: GaussianWorldModel, b: GaussianWorldModel) -> None:
     left, right = a.state_dict(), b.state_dict()
     assert left.keys() == right.keys()
     for key, value in left.items():
-        same = value == right[key]
-        assert bool(same.all() if isinstance(value, torch.Tensor) else same), key
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == right[key].dtype
+            # The bounds of the actions are NaN until they are known.
+            assert torch.equal(value.nan_to_num(7.0), right[key].nan_to_num(7.0)), key
+        else:
+            assert value == right[key], key
 
 
 def test_learns_the_dynamics_and_where_the_cup_moves() -> None:
@@ -228,6 +236,7 @@ def test_checkpoints_that_are_refused(tmp_path: Path) -> None:
 
     def refused(message: str, td: TensorDict = data, **kwargs: Any) -> None:
         model = kwargs.pop("model", None) or make()
+        model.set_action_bounds(0.0, 1.0)
         before = module._copy(model.state_dict())
         with pytest.raises(ValueError, match=message):
             fit(model, td, checkpoint=path, **kwargs)
@@ -437,3 +446,160 @@ def test_wrong_data_are_named(tmp_path: Path) -> None:
     other["action"][99, 1] = -float("inf")
     refused(ValueError, "'action' is -inf in column 1 of row 199", [data, other])
     shutil.rmtree(tmp_path)
+
+
+# --- the bounds of the actions -------------------------------------------------------
+
+SPEC = Bounded(-1.0, 1.0, (2,))
+
+
+def test_bounds_are_those_of_the_spec_then_of_the_folder_then_of_the_data(
+    tmp_path: Path,
+) -> None:
+    data = world(400)
+    stored = write_transitions(
+        data.clone().set(("next", "done"), torch.zeros(400, 1, dtype=torch.bool)),
+        tmp_path / "data",
+        action_bounds=([-1.0, -1.5], [1.0, 1.5]),
+    )
+    for sources, spec, low, high in (
+        (data, SPEC, [-1.0, -1.0], [1.0, 1.0]),
+        (stored, SPEC, [-1.0, -1.0], [1.0, 1.0]),
+        (stored, None, [-1.0, -1.5], [1.0, 1.5]),
+        ([data, stored], None, [-1.0, -1.5], [1.0, 1.5]),
+    ):
+        model = make()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            fit(model, sources, action_spec=spec)
+        assert model.action_low.tolist() == low and model.action_high.tolist() == high
+        twin = make()
+        twin.load_state_dict(model.state_dict())
+        assert_equal(twin, model)
+    model = make()
+    with pytest.warns(UserWarning, match=r"not known: 'action' is .* \[-0\.998048, 0"):
+        fit(model, data)
+    assert torch.equal(model.action_low, data["action"].amin(0))
+    assert torch.equal(model.action_high, data["action"].amax(0))
+
+
+@pytest.mark.parametrize("scale", [90.0, 0.01])
+def test_the_unit_of_the_actions_does_not_matter(scale: float) -> None:
+    """Degrees and small forces give the scores of actions in [-1, 1]."""
+    data, fresh = world(2000), world(200, seed=1)
+    found = []
+    for unit in (1.0, scale):
+        own = data.clone().set("action", data["action"] * unit)
+        model = make(variance_floor=0.02)
+        spec = Bounded(-unit, unit, (2,))
+        fit(model, own, steps=300, batch_size=128, lr=3e-3, action_spec=spec)
+        found.append(CAI(model, num_actions=32)(fresh)[:, 1])
+    assert 0.2 < (found[0] > 0.1).float().mean() < 0.8
+    assert ((found[0] > 0.1) == (found[1] > 0.1)).float().mean() > 0.98
+
+
+def test_actions_outside_of_the_bounds_are_refused() -> None:
+    data = world(400)
+    data["action"][123, 1] = 1.001
+    message = r"'action' is 1\.001 in column 1 of row 123, expected \[-1, 1\] \(1 such"
+    with pytest.raises(ValueError, match=message):
+        fit(make(), data, action_spec=SPEC)
+    with pytest.raises(ValueError, match="column 1 of row 523"):
+        fit(make(), [world(400), data], action_spec=SPEC)
+    data["action"][123, 1] = 1.0001  # rounding
+    fit(make(), data, action_spec=SPEC)
+    with pytest.raises(TypeError, match="Bounded spec, got Unbounded"):
+        fit(make(), data, action_spec=Unbounded((2,)))
+    with pytest.raises(ValueError, match=r"shape \[3\].*\[2\]"):
+        fit(make(), data, action_spec=Bounded(-1.0, 1.0, (3,)))
+
+
+def test_data_sets_with_other_bounds_are_refused(tmp_path: Path) -> None:
+    data = world(400).set(("next", "done"), torch.zeros(400, 1, dtype=torch.bool))
+    one, other = (
+        write_transitions(
+            data, tmp_path / f"{high}", action_bounds=([-1.0] * 2, [1.0, high])
+        )
+        for high in (1.0, 90.0)
+    )
+    with pytest.raises(ValueError, match=r"data set 1 .* x \[-1, 90\].* x \[-1, 1\]"):
+        fit(make(), [one, other])
+    fit(make(), [one, other], action_spec=SPEC)
+
+
+@pytest.mark.parametrize(
+    ("column", "columns"),
+    [(torch.zeros(400), [0]), (torch.linspace(0.2, 0.29, 400), [0]), (None, [])],
+)
+def test_actions_that_hardly_vary_are_warned_of(
+    column: torch.Tensor | None, columns: list[int]
+) -> None:
+    data = world(400)
+    if column is not None:
+        data["action"][:, 0] = column
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        fit(make(), data, action_spec=SPEC)
+    texts = [str(warning.message) for warning in found]
+    assert len(texts) == len(columns)
+    if columns:
+        assert texts[0].startswith(f"the columns {columns} of 'action' hardly vary")
+    # Without a spec, a constant column is still one.
+    data["action"][:, 1] = 0.5
+    with pytest.warns(UserWarning, match=r"columns \[.*1\] of 'action' hardly vary"):
+        fit(make(), data)
+
+
+def test_checkpoints_record_the_bounds(tmp_path: Path) -> None:
+    path, data = tmp_path / "fit", world(400)
+    fit(make(), data, action_spec=SPEC, checkpoint=path, steps=20)
+    with pytest.raises(ValueError, match="action_bounds: saved"):
+        fit(make(), data, action_spec=Bounded(-2, 2, (2,)), checkpoint=path)
+    resumed, straight = make(), make()
+    fit(resumed, data, action_spec=SPEC, checkpoint=path)
+    fit(straight, data, action_spec=SPEC)
+    assert_equal(resumed, straight)
+    old = resumed.state_dict()
+    del old["action_low"], old["action_high"]
+    with pytest.raises(ValueError, match="is of an earlier version"):
+        make().load_state_dict(old)
+
+
+# --- what the log says of a fit ------------------------------------------------------
+
+
+def test_a_good_fit_is_not_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    model = make(variance_floor=0.02)
+    fit(model, world(), action_spec=SPEC, steps=300, batch_size=128, lr=3e-3)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("target", ["change", "absolute"])
+def test_a_model_that_predicts_nothing_is_warned_of(
+    target: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = world()
+    data["action"] = data["action"][torch.randperm(2000)]  # not those that were taken
+    data["next", "observation"][:, 3] = data["observation"][:, 3]  # stays
+    data["next", "observation"][:, 2] = data["observation"][:, 2]
+    fit(make(target=target), data, action_spec=SPEC, steps=20, lr=1e-6)
+    (record,) = caplog.records
+    assert "the model predicts ['arm'] no better than that nothing moves" in (
+        record.getMessage()
+    )
+
+
+def test_overfitting_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    few = world(60)
+    few["next", "observation"] += torch.randn(60, 4)
+    fit(
+        make(variance_floor=1e-6),
+        few,
+        action_spec=SPEC,
+        steps=300,
+        batch_size=60,
+        eval_every=10,
+        lr=1e-2,
+    )
+    messages = [record.getMessage() for record in caplog.records]
+    assert any(re.match(r"the best step was \d0? of 300", text) for text in messages)

@@ -18,6 +18,7 @@ from tensordict import TensorDictBase
 from torchrl.data import HERReplayBuffer, SliceSampler, TensorStorage
 from torchrl.objectives import SoftUpdate
 
+from tests.influence.scoring import ready
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.data import load_transitions, mix_trajectories, offline_buffer
 from torchrl_caiac.evaluation import (
@@ -214,7 +215,7 @@ def test_comparison_of_estimators(flat_data: TensorDictBase) -> None:
         "table = ",
         data=flat_data,
         truth=SimpleNamespace(influenced=influenced),
-        model=GaussianWorldModel(LAYOUT, 2, (16, 16)),
+        model=ready(GaussianWorldModel(LAYOUT, 2, (16, 16))),
         attention=AttentionInfluence(transformer),
         Candidate=Candidate,
         compare_influence=compare_influence,
@@ -265,7 +266,8 @@ def test_new_estimator(flat_data: TensorDictBase) -> None:
 def test_other_keys(flat_data: TensorDictBase) -> None:
     flat_data["collector", "traj_ids"] = flat_data.pop("episode")
     rb = offline_buffer(flat_data, batch_size=8)
-    run_usage("keys = ", rb=rb, estimator=CAI(GaussianWorldModel(LAYOUT, 2, (16, 16))))
+    model = ready(GaussianWorldModel(LAYOUT, 2, (16, 16)))
+    run_usage("keys = ", rb=rb, estimator=CAI(model))
     assert rb.sample()["caiac", "counterfactual"].sum() == 4
 
 
@@ -299,7 +301,7 @@ def test_citation_has_the_version() -> None:
 @pytest.mark.gpu
 @in_memory
 def test_on_a_gpu(flat_data: TensorDictBase) -> None:
-    model = GaussianWorldModel(LAYOUT, 2, (16, 16))
+    model = ready(GaussianWorldModel(LAYOUT, 2, (16, 16)))
     rb = run_usage("model.to", data=flat_data, model=model)["rb"]
     batch = rb.sample()
     assert all(leaf.is_cuda for leaf in batch.values(True, True))

@@ -20,6 +20,7 @@ LAYERS = [
         "_processes",
         "_random",
         "_torchrl",
+        "_whole_files",
     },
     {"_layout_format", "_layout_reading", "entities", "trajectories"},
     {"checkpoint", "data"},

@@ -372,6 +372,6 @@ def column_ranges(columns: Sequence[int]) -> str:
         >>> column_ranges([2, 3, 4]), column_ranges([4, 2])
         ('[2:5]', '[4, 2]')
     """
-    if len(columns) > 1 and list(columns) == list(range(columns[0], columns[-1] + 1)):
+    if len(columns) > 1 and all(b == a + 1 for a, b in pairwise(columns)):
         return f"[{columns[0]}:{columns[-1] + 1}]"
     return str(list(columns))

@@ -1,12 +1,13 @@
-"""Atomic writing of files and folders, and folders with one writing process."""
+"""Reading and writing files: whole, checked, with space, and by one process."""
 
 from __future__ import annotations
 
+import errno
 import json
+import logging
 import os
-import re
 import shutil
-import tempfile
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,119 +15,222 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from torchrl_caiac._whole_files import (
+    remove_leftovers,
+    remove_leftovers_in,
+    whole_file,
+    whole_folder,
+)
+
 __all__ = [
+    "UnreadableFileError",
+    "check_archive",
     "claim_folder",
     "plain",
+    "read_json",
+    "recover_meta",
     "remove_leftovers",
+    "remove_leftovers_in",
+    "reserve",
+    "safe_meta",
     "whole_file",
     "whole_folder",
     "write_json",
 ]
 
-_PARTIAL = ".partial-"
+_logger = logging.getLogger("torchrl_caiac")
+
+_MOST_JSON = 64 << 20  # bytes; settings, layouts and records are far smaller
+_META = "meta.json"  # tensordict's, one in every folder of a memory-mapped tensordict
+_META_COPY = "meta.json.bak"
 
 
-@contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Context manager that writes a file atomically.
+class UnreadableFileError(ValueError):
+    """A file or folder is truncated, damaged, or not what it should be.
 
-    The file replaces ``path`` at the end of the block. If the block raises, the old
-    file is unchanged. Missing parent folders are created.
-
-    Args:
-        path (path): the file to write.
-
-    Yields:
-        Path: a temporary file in the same folder, with the same suffix.
+    The message names the path, what was found, and what to do.
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_caiac._files import whole_file
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with whole_file(f"{folder}/results/table.txt") as partial:
-        ...         _ = partial.write_text("42")
-        ...     open(f"{folder}/results/table.txt").read()
-        '42'
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{_PARTIAL}{os.getpid()}-{path.name}")
-    try:
-        yield partial
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def remove_leftovers(path: str | os.PathLike[str]) -> None:
-    """Removes the partial files of interrupted calls of :func:`whole_file`.
-
-    Temporary files and folders whose names begin with that of a partial file, which
-    other libraries create, are removed too. No other process may be writing the file.
-
-    Args:
-        path (path): the file.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac._files import remove_leftovers
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = Path(f"{folder}/.partial-7-table.txt").write_text("4")
-        ...     remove_leftovers(f"{folder}/table.txt")
-        ...     os.listdir(folder)
-        []
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        return
-    pattern = rf"\.?{re.escape(_PARTIAL)}\d+-{re.escape(path.name)}(\.\w+-\w+)?"
-    for left in path.parent.iterdir():
-        if re.fullmatch(pattern, left.name):
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                left.unlink(missing_ok=True)
-
-
-@contextmanager
-def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Context manager that writes a folder atomically.
-
-    The folder replaces ``path`` at the end of the block. If the block raises, the old
-    folder is unchanged. Missing parent folders are created.
-
-    Args:
-        path (path): the folder to write.
-
-    Yields:
-        Path: a temporary folder on the same file system, to be created in the block.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_caiac._files import whole_folder
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with whole_folder(f"{folder}/data") as partial:
-        ...         partial.mkdir()
-        ...     os.path.isdir(f"{folder}/data")
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.data import UnreadableFileError
+        >>> with tempfile.NamedTemporaryFile() as file:
+        ...     try:
+        ...         EntityLayout.load(file.name)
+        ...     except UnreadableFileError as error:
+        ...         file.name in str(error)
         True
     """
+
+
+def reserve(path: str | os.PathLike[str], nbytes: int | None = None) -> None:
+    """Allocates the space of files, before they are written through memory.
+
+    A memory-mapped file has no blocks until it is written to. If the disk is full by
+    then, the operating system ends the process by a signal. After this call there is
+    space for every byte. The content of the files is not changed.
+
+    Args:
+        path (path): a file, created if it is missing; or a folder, for all files in it
+            and in its subfolders.
+        nbytes (int, optional): the size that the file gets. Defaults to ``None``: the
+            current size of each file.
+
+    Raises:
+        OSError: with ``errno.ENOSPC``, the disk has too little space. A file that this
+            call created is removed, one that it enlarged has its old size.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import reserve
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     reserve(f"{folder}/score.memmap", 4096)
+        ...     os.path.getsize(f"{folder}/score.memmap")
+        4096
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_PARTIAL))
-    made, replaced = partial / path.name, partial / f"replaced-{path.name}"
+    if path.is_dir():
+        for file in sorted(item for item in path.rglob("*") if item.is_file()):
+            _reserve_file(file, file.stat().st_size)
+    else:
+        _reserve_file(path, path.stat().st_size if nbytes is None else nbytes)
+
+
+def _reserve_file(file: Path, nbytes: int) -> None:
+    before = file.stat().st_size if file.exists() else None
+    descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        yield made
-        was_there = path.exists()
-        if was_there:
-            os.replace(path, replaced)
-        try:
-            os.replace(made, path)
-        except OSError:
-            if was_there:
-                os.replace(replaced, path)
+        os.ftruncate(descriptor, nbytes)
+        if nbytes:
+            _allocate(descriptor, nbytes)
+    except OSError as error:
+        if before is None:
+            file.unlink()
+        else:
+            os.ftruncate(descriptor, before)
+        if error.errno not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
             raise
+        free = shutil.disk_usage(file.parent).free
+        raise OSError(
+            errno.ENOSPC,
+            f"the disk is full: {file} needs {nbytes} bytes, {free} are free; make "
+            "space, or give a folder on another disk",
+        ) from error
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        os.close(descriptor)
+
+
+def _allocate(descriptor: int, nbytes: int) -> None:
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(descriptor, 0, nbytes)
+            return
+        except OSError as error:
+            # Some file systems do not support it.
+            if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise
+    system = os.fstatvfs(descriptor)
+    used = os.fstat(descriptor).st_blocks * 512
+    if nbytes - used > system.f_bavail * system.f_frsize:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@contextmanager
+def safe_meta(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Context manager for adding leaves to a memory-mapped tensordict.
+
+    tensordict writes ``meta.json`` in place, so a process that is killed may leave an
+    empty one. In the block, a copy of every ``meta.json`` lies beside it. If the
+    process is killed, :func:`recover_meta` restores them, and
+    :func:`~torchrl_caiac.data.load_transitions` calls it. If the block raises, damaged
+    files are restored at once.
+
+    Args:
+        folder (path): the outermost folder of the tensordict.
+
+    Raises:
+        UnreadableFileError: a ``meta.json`` is damaged, and there is no copy.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._files import safe_meta
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     data = TensorDict({"action": torch.zeros(3, 2)}, [3]).memmap(folder)
+        ...     with safe_meta(folder):
+        ...         _ = data.make_memmap(("caiac", "score"), shape=[3, 2])
+        ...     sorted(os.listdir(folder))
+        ['action.memmap', 'caiac', 'meta.json']
+    """
+    recover_meta(folder)
+    files = _meta_files(folder)
+    damaged = [str(file) for file in files if not _is_json(file)]
+    if damaged:
+        raise UnreadableFileError(
+            f"{', '.join(damaged)} is damaged, and has no copy to restore: delete the "
+            "folder and create the data again"
+        )
+    for file in files:
+        with whole_file(file.with_name(_META_COPY)) as partial:
+            shutil.copyfile(file, partial)
+    try:
+        yield
+    finally:
+        recover_meta(folder)
+        for file in files:
+            file.with_name(_META_COPY).unlink(missing_ok=True)
+
+
+def recover_meta(folder: str | os.PathLike[str]) -> bool:
+    """Undoes the addition of a leaf that was killed, where :func:`safe_meta` was used.
+
+    Nothing happens if every ``meta.json`` can be read. Otherwise, all of them become
+    what they were before the leaf.
+
+    Args:
+        folder (path): the outermost folder of a memory-mapped tensordict.
+
+    Returns:
+        bool: whether files were restored.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import recover_meta
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(f"{folder}/meta.json").write_text("")
+        ...     _ = Path(f"{folder}/meta.json.bak").write_text("{}")
+        ...     recover_meta(folder), Path(f"{folder}/meta.json").read_text()
+        (True, '{}')
+    """
+    copies = [
+        file
+        for file in Path(folder).rglob(_META_COPY)
+        if file.is_file() and _is_json(file)
+    ]
+    if not copies or all(_is_json(file) for file in _meta_files(folder)):
+        return False
+    # All, not only the damaged one: an outer file may list what an inner one lost.
+    for copy in sorted(copies):
+        with whole_file(copy.with_name(_META)) as partial:
+            shutil.copyfile(copy, partial)
+    _logger.warning(
+        "%s: a leaf was being added when a process was killed; meta.json is restored, "
+        "without that leaf",
+        folder,
+    )
+    return True
+
+
+def _meta_files(folder: str | os.PathLike[str]) -> list[Path]:
+    return sorted(file for file in Path(folder).rglob(_META) if file.is_file())
+
+
+def _is_json(file: Path) -> bool:
+    try:
+        return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
+    except (ValueError, RecursionError):
+        return False
 
 
 def plain(value: Any) -> Any:
@@ -173,6 +277,94 @@ def write_json(
     text = json.dumps(plain(value), indent=indent) + "\n"
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def read_json(path: str | os.PathLike[str], what: str, remedy: str) -> Any:
+    """Reads a JSON file.
+
+    Args:
+        path (path): the file.
+        what (str): what the file is, for the error message, such as ``"layout"``.
+        remedy (str): the end of the message, which says what to do.
+
+    Returns:
+        Any: the content.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UnreadableFileError: it is not a file, is not JSON, or is too large for JSON.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import read_json
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(f"{folder}/a.json").write_text('{"b": 1}')
+        ...     read_json(f"{folder}/a.json", "record", "delete it")
+        {'b': 1}
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    try:
+        if not path.is_file():
+            raise ValueError("it is not a file")
+        if size > _MOST_JSON:
+            raise ValueError(f"it has {size} bytes, expected at most {_MOST_JSON}")
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UnreadableFileError(
+            f"{path} is not a readable {what}, it may be truncated or damaged "
+            f"({error}): {remedy}"
+        ) from error
+
+
+def check_archive(path: str | os.PathLike[str], what: str, remedy: str) -> None:
+    """Raises if a ZIP file cannot be read in the space that it takes on disk.
+
+    The files of this package are not compressed. A small compressed file could expand
+    to any size.
+
+    Args:
+        path (path): the file.
+        what (str): what the file is, for the error message.
+        remedy (str): the end of the message, which says what to do.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UnreadableFileError: it is not a ZIP file, has compressed or encrypted parts, or
+            parts that are larger than the file.
+
+    Examples:
+        >>> import tempfile, zipfile
+        >>> from torchrl_caiac._files import check_archive
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with zipfile.ZipFile(f"{folder}/a.zip", "w") as archive:
+        ...         archive.writestr("b", "1")
+        ...     check_archive(f"{folder}/a.zip", "archive", "delete it")
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    try:
+        if not path.is_file():
+            raise ValueError("it is not a file")
+        with zipfile.ZipFile(path) as archive:
+            parts = archive.infolist()
+        packed = [
+            part.filename
+            for part in parts
+            if part.compress_type != zipfile.ZIP_STORED
+            or part.flag_bits & 1  # encrypted
+            or part.compress_size != part.file_size
+        ]
+        if packed:
+            raise ValueError(f"{packed} are compressed or encrypted")
+        total = sum(part.file_size for part in parts)
+        if total > size:
+            raise ValueError(f"its parts have {total} bytes, the file has {size}")
+    except Exception as error:  # zipfile raises many kinds for damaged files
+        raise UnreadableFileError(
+            f"{path} is not a readable {what}, it may be truncated or damaged "
+            f"({error}): {remedy}"
+        ) from error
 
 
 @contextmanager

@@ -200,7 +200,8 @@ def flatten(value: Any, batch_dims: int) -> torch.Tensor:
         batch_dims (int): the number of batch dimensions.
 
     Returns:
-        torch.Tensor: ``[*B, W]``. Integers and booleans become floating point.
+        torch.Tensor: ``[*B, W]``. Integers and booleans become floating point, see
+        :func:`floating`.
 
     Examples:
         >>> import torch
@@ -214,5 +215,30 @@ def flatten(value: Any, batch_dims: int) -> torch.Tensor:
     if is_tensor_collection(value):
         leaves = [value.get(key) for key in sorted(value.keys(), key=str)]
         return torch.cat([flatten(leaf, batch_dims) for leaf in leaves], -1)
-    value = value if value.is_floating_point() else value.to(torch.get_default_dtype())
-    return value.reshape(*value.shape[:batch_dims], -1)
+    return floating(value).reshape(*value.shape[:batch_dims], -1)
+
+
+def floating(value: torch.Tensor) -> torch.Tensor:
+    """Returns a tensor to compute with: integers and booleans become floating point.
+
+    Differences of unsigned integers would wrap around, and booleans have none.
+
+    Args:
+        value (torch.Tensor): ``[*]``, of any dtype.
+
+    Returns:
+        torch.Tensor: ``[*]``, the same tensor if it is in floating point; float64 for
+        integers of 32 and 64 bits, and float32 for shorter ones, which it holds
+        exactly.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac._keys import floating
+        >>> before, after = torch.tensor([[7], [6]], dtype=torch.uint8)
+        >>> floating(after) - floating(before)
+        tensor([-1.])
+    """
+    if value.is_floating_point():
+        return value
+    short = value.dtype.itemsize <= 2
+    return value.to(torch.float32 if short else torch.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,9 @@ __all__ = ["layout_arguments", "layout_text", "layout_to_dict"]
 
 _FORMAT = "torchrl_caiac.EntityLayout"
 _VERSION = 1
+_KEYS = {"format", "version", "entities", "flat", "goal", "achieved", "fixed"}
+_KEYS |= {"next_key"}
+_MOST_COLUMNS = 2**31 - 1
 # The keys that only flat layouts have.
 _FLAT_KEYS = ("observation_key", "desired_goal_key", "achieved_goal_key")
 
@@ -66,8 +70,6 @@ def layout_arguments(content: Any) -> tuple[bool, dict[str, Any]]:
         ``EntityLayout`` or ``EntityLayout.from_keys``.
 
     Raises:
-        KeyError: an entry is missing.
-        TypeError: an entry has another type.
         ValueError: the content does not describe a layout, or has another version.
 
     Examples:
@@ -84,24 +86,75 @@ def layout_arguments(content: Any) -> tuple[bool, dict[str, Any]]:
         )
     if content.get("version") != _VERSION:
         raise ValueError(
-            f"the layout has version {content.get('version')!r}, expected {_VERSION}: "
-            "update torchrl_caiac"
+            f"the layout has version {reprlib.repr(content.get('version'))}, expected "
+            f"{_VERSION}: update torchrl_caiac"
         )
-    named = {
-        part: {name: key_from_json(value) for name, value in content[part]}
-        for part in ("entities", "goal", "achieved")
-    }
+    is_flat = content.get("flat")
+    if not isinstance(is_flat, bool):
+        raise _unexpected("flat", "true or false", is_flat)
+    expected = _KEYS | set(_FLAT_KEYS if is_flat else ())
+    if content.keys() != expected:
+        raise ValueError(
+            f"the layout lacks {sorted(expected - content.keys())} and has the unknown "
+            f"{reprlib.repr(sorted(map(str, content.keys() - expected)))}"
+        )
+    named = {part: _pairs(content, part) for part in ("entities", "goal", "achieved")}
+    for part, pairs in named.items():
+        for name, value in pairs.items():
+            where = f"{part} of {name!r}"
+            if is_flat:
+                pairs[name] = _columns(value, where)
+            elif value is not None or part == "entities":
+                pairs[name] = _key(value, where)
+    fixed = content["fixed"]
+    if not _is_list_of(str, fixed):
+        raise _unexpected("fixed", "a list of names", fixed)
     arguments: dict[str, Any] = {
         "entities": named["entities"],
         "goal": named["goal"] or None,
         "achieved": named["achieved"] or None,
-        "fixed": content["fixed"],
-        "next_key": key_from_json(content["next_key"]),
+        "fixed": fixed,
+        "next_key": _key(content["next_key"], "next_key"),
     }
-    is_flat = bool(content["flat"])
     if is_flat:
-        arguments |= {key: key_from_json(content[key]) for key in _FLAT_KEYS}
+        arguments |= {key: _key(content[key], key) for key in _FLAT_KEYS}
     return is_flat, arguments
+
+
+def _pairs(content: Mapping[str, Any], part: str) -> dict[str, Any]:
+    pairs = content[part]
+    if not isinstance(pairs, (list, tuple)) or not all(
+        isinstance(pair, (list, tuple)) and len(pair) == 2 and isinstance(pair[0], str)
+        for pair in pairs
+    ):
+        raise _unexpected(part, "a list of [name, columns or key] pairs", pairs)
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        raise _unexpected(part, "each name once", [name for name, _ in pairs])
+    return result
+
+
+def _columns(value: Any, where: str) -> tuple[int, ...]:
+    if not _is_list_of(int, value) or not all(0 <= x < _MOST_COLUMNS for x in value):
+        raise _unexpected(where, f"a list of columns from 0 to {_MOST_COLUMNS}", value)
+    return tuple(value)
+
+
+def _key(value: Any, where: str) -> Any:
+    if isinstance(value, str) or (value and _is_list_of(str, value)):
+        return key_from_json(list(value) if isinstance(value, tuple) else value)
+    raise _unexpected(where, "a key: text, or a list of texts", value)
+
+
+def _is_list_of(kind: type, value: Any) -> bool:
+    # type(), because True is an int.
+    return isinstance(value, (list, tuple)) and all(type(x) is kind for x in value)
+
+
+def _unexpected(where: str, expected: str, found: Any) -> ValueError:
+    return ValueError(
+        f"{where} of the layout: expected {expected}, got {reprlib.repr(found)}"
+    )
 
 
 def layout_text(layout: EntityLayout) -> str:

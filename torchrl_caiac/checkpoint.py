@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import hashlib
 import json
 import os
+import shutil
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +16,19 @@ from typing import Any
 import torch
 from torchrl.checkpoint import Checkpoint, GlobalRNGState, StateDictCheckpointAdapter
 
-from torchrl_caiac._files import plain, remove_leftovers, whole_file
+from torchrl_caiac._files import (
+    UnreadableFileError,
+    check_archive,
+    plain,
+    remove_leftovers,
+    whole_file,
+)
 
 __all__ = ["TrainingCheckpoint"]
 
 _CONTENT = "torchrl_caiac.checkpoint/1"
+_MANIFEST = "manifest.json"  # TorchRL's
+_WHAT = "checkpoint of this run"
 _ADVICE = "delete it to start from scratch, or give another path"
 
 
@@ -29,6 +41,7 @@ class TrainingCheckpoint:
     (:class:`~torchrl.checkpoint.Checkpoint`) in the archive format.
 
     - A file is written atomically: an interrupted write leaves the old file as it was.
+    - Runs that do the same write the same bytes: the file has no date and no random id.
     - Loading is all or nothing: if :meth:`load` raises, no part has changed.
     - Loading executes no code from the file: only tensors and plain containers are
       read.
@@ -73,7 +86,7 @@ class TrainingCheckpoint:
         # Through JSON, so that tuples equal lists.
         self._settings = json.loads(json.dumps(plain(settings or {})))
         self._parts = {**parts, "rng": GlobalRNGState()} if rng else parts
-        self._checkpoint = Checkpoint(format="archive")
+        self._checkpoint = Checkpoint(format="directory")
         for name, part in self._parts.items():
             self._checkpoint.register(name, part, adapter=_TensorsOnly("torch"))
 
@@ -86,7 +99,12 @@ class TrainingCheckpoint:
         metadata = {"content": _CONTENT, "step": step, "settings": self._settings}
         # TorchRL moves an old file away before it puts the new one in its place.
         with whole_file(self.path) as partial:
-            self._checkpoint.save(partial, metadata=metadata)
+            parts = partial.with_name(f"{partial.name}.parts-0")
+            try:
+                self._checkpoint.save(parts, metadata=metadata)
+                _write_archive(parts, partial)
+            finally:
+                shutil.rmtree(parts, ignore_errors=True)
 
     def load(self, *, max_step: int | None = None) -> int:
         """Restores all parts if the file exists.
@@ -100,12 +118,13 @@ class TrainingCheckpoint:
             int: the number of steps taken, 0 if there is no file.
 
         Raises:
-            ValueError: the file is truncated or not a checkpoint of this run, its
-                settings differ, or it has more than ``max_step`` steps.
+            UnreadableFileError: the file is truncated or not a checkpoint of this run.
+            ValueError: its settings differ, or it has more than ``max_step`` steps.
         """
         remove_leftovers(self.path)
         if not self.path.exists():
             return 0
+        check_archive(self.path, _WHAT, _ADVICE)
         try:
             step, settings = self._read_manifest()
         except Exception as error:
@@ -132,8 +151,6 @@ class TrainingCheckpoint:
 
     def _read_manifest(self) -> tuple[int, dict[str, Any]]:
         """Returns the steps and the settings of the file, after checking its parts."""
-        if not self.path.is_file():
-            raise ValueError("it is not a file")
         manifest = Checkpoint.manifest(self.path)
         metadata, parts = manifest["metadata"], sorted(manifest["components"])
         if metadata.get("content") != _CONTENT:
@@ -142,7 +159,10 @@ class TrainingCheckpoint:
             )
         if parts != sorted(self._parts):
             raise ValueError(f"expected the parts {sorted(self._parts)}, got {parts}")
-        return int(metadata["step"]), dict(metadata["settings"])
+        step, settings = metadata["step"], metadata["settings"]
+        if type(step) is not int or step < 0 or not isinstance(settings, dict):
+            raise ValueError(f"the step is {step!r} and the settings are {settings!r}")
+        return step, settings
 
     def _restore(self, states: Mapping[str, Any]) -> None:
         """Restores all parts, or none."""
@@ -153,14 +173,16 @@ class TrainingCheckpoint:
             for name, part in self._parts.items():
                 part.load_state_dict(states[name])
         except BaseException:
-            for name, part in self._parts.items():
-                part.load_state_dict(before[name])
+            # Each, even where another cannot be restored.
+            with contextlib.ExitStack() as stack:
+                for name, part in self._parts.items():
+                    stack.callback(part.load_state_dict, before[name])
             raise
 
-    def _unreadable(self, error: Exception) -> ValueError:
-        return ValueError(
-            f"{self.path} is not a readable checkpoint of this run, it may be "
-            f"truncated ({error}): {_ADVICE}"
+    def _unreadable(self, error: Exception) -> UnreadableFileError:
+        return UnreadableFileError(
+            f"{self.path} is not a readable {_WHAT}, it may be truncated or damaged "
+            f"({error}): {_ADVICE}"
         )
 
 
@@ -173,11 +195,41 @@ class _TensorsOnly(StateDictCheckpointAdapter):
 
     def load(self, component: Any, path: Path, **kwargs: Any) -> Any:
         """Returns the state; the caller loads it once all states have been read."""
+        file = path / self.state_torch
+        check_archive(file, "state", "the checkpoint is damaged")
         return torch.load(
-            path / self.state_torch,
+            file,
             map_location=kwargs["map_location"],
             weights_only=True,
         )
+
+
+def _write_archive(parts: Path, archive: Path) -> None:
+    """Writes a folder of :class:`Checkpoint` in its archive format.
+
+    TorchRL's own archives have the time of saving and a random id, these have not.
+    """
+    manifest = parts / _MANIFEST
+    files = sorted(file for file in parts.rglob("*") if file.is_file())
+    digest = hashlib.sha256()
+    with zipfile.ZipFile(archive, "w") as target:
+        for file in [file for file in files if file != manifest]:
+            name = file.relative_to(parts).as_posix()
+            digest.update(name.encode())
+            info = zipfile.ZipInfo(name)
+            info.file_size = file.stat().st_size  # decides on ZIP64
+            with file.open("rb") as source, target.open(info, "w") as sink:
+                while chunk := source.read(1 << 20):
+                    digest.update(chunk)
+                    sink.write(chunk)
+        content = json.loads(manifest.read_text(encoding="utf-8"))
+        content |= {
+            "container": "archive",
+            "checkpoint_id": digest.hexdigest()[:32],
+            "created_at": "1980-01-01T00:00:00+00:00",
+        }
+        text = json.dumps(content, indent=2, sort_keys=True)
+        target.writestr(zipfile.ZipInfo(_MANIFEST), text + "\n")
 
 
 def _differences(saved: Any, given: Any, name: str = "") -> Iterator[str]:

@@ -12,8 +12,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac import _columns
-from torchrl_caiac._files import write_json
-from torchrl_caiac._keys import as_key, join
+from torchrl_caiac._files import UnreadableFileError, read_json, write_json
+from torchrl_caiac._keys import as_key, floating, join
 from torchrl_caiac._layout_format import layout_arguments, layout_text, layout_to_dict
 from torchrl_caiac._layout_reading import (
     check_data,
@@ -329,8 +329,10 @@ class EntityLayout:
             next (bool): read the next state. Defaults to ``False``.
 
         Returns:
-            torch.Tensor: ``[*B, W]``, where ``W`` is the sum of the widths. It may
-            share memory with ``td``: do not write to it.
+            torch.Tensor: ``[*B, W]``, where ``W`` is the sum of the widths. Integers
+            and booleans become floating point, float64 if they have more than 16
+            bits, so that differences do not wrap around. The tensor may share memory
+            with ``td``: do not write to it.
 
         Raises:
             KeyError: a key is missing.
@@ -349,9 +351,10 @@ class EntityLayout:
             return torch.cat(list(read_entities(self, td, next=next).values()), -1)
         observation = read_observation(self, td, next=next)
         columns = [c for columns in self.columns.values() for c in columns]
-        if columns == list(range(observation.shape[-1])):
-            return observation
-        return observation[..., self.index_tensor("read", columns, observation.device)]
+        if columns != list(range(observation.shape[-1])):
+            where = self.index_tensor("read", columns, observation.device)
+            observation = observation[..., where]
+        return floating(observation)
 
     def achieved_goal(self, td: TensorDictBase, *, next: bool = False) -> torch.Tensor:
         """Returns the goal that a state achieves (flat layouts only).
@@ -514,6 +517,7 @@ class EntityLayout:
             EntityLayout: the layout.
 
         Raises:
+            TypeError: a name is empty.
             ValueError: the content does not describe a layout, or has another version.
 
         Examples:
@@ -522,13 +526,8 @@ class EntityLayout:
             >>> EntityLayout.from_dict(content).names
             ('arm',)
         """
-        try:
-            is_flat, arguments = layout_arguments(content)
-            return cls(**arguments) if is_flat else cls.from_keys(**arguments)
-        except (KeyError, TypeError) as error:
-            raise ValueError(
-                f"the content does not describe a valid layout: {error}"
-            ) from error
+        is_flat, arguments = layout_arguments(content)
+        return cls(**arguments) if is_flat else cls.from_keys(**arguments)
 
     def save(self, path: str | Path) -> None:
         """Writes the layout as JSON, atomically.
@@ -559,7 +558,7 @@ class EntityLayout:
 
         Raises:
             FileNotFoundError: the file does not exist.
-            ValueError: the file is truncated or does not describe a layout.
+            UnreadableFileError: the file is truncated or does not describe a layout.
 
         Examples:
             >>> import tempfile
@@ -569,11 +568,14 @@ class EntityLayout:
             ...     EntityLayout.load(f"{folder}/layout.json").names
             ('arm',)
         """
-        text = Path(path).read_text(encoding="utf-8")
+        what, remedy = "layout", "save the layout again"
+        content = read_json(path, what, remedy)
         try:
-            return cls.from_dict(json.loads(text))
-        except ValueError as error:  # JSONDecodeError is one
-            raise ValueError(f"{path} is not a readable layout: {error}") from error
+            return cls.from_dict(content)
+        except (ValueError, TypeError) as error:
+            raise UnreadableFileError(
+                f"{path} is not a readable {what} ({error}): {remedy}"
+            ) from error
 
     # --- comparing and showing ---------------------------------------------------
 

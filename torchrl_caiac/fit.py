@@ -13,11 +13,17 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
+from torchrl.data import Bounded
 from tqdm.auto import tqdm
 
-from torchrl_caiac._keys import as_key, get_leaf, jsonable
+from torchrl_caiac._keys import as_key, floating, get_leaf, jsonable
 from torchrl_caiac.check import check_before_use
 from torchrl_caiac.checkpoint import TrainingCheckpoint
+from torchrl_caiac.modules._action_bounds import (
+    check_actions,
+    filled_bounds,
+    known_bounds,
+)
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 from torchrl_caiac.trajectories import trajectory_index
 
@@ -32,6 +38,7 @@ def fit_world_model(
     model: EntityDynamicsModel,
     data: TensorDictBase | Sequence[TensorDictBase],
     *,
+    action_spec: Bounded | None = None,
     steps: int = 100_000,
     batch_size: int = 500,
     lr: float = 8e-4,
@@ -54,7 +61,8 @@ def fit_world_model(
     validation. The model is left in evaluation mode, with the weights and statistics of
     the step with the lowest negative log likelihood on the validation data. The scale
     of the targets comes from the training trajectories, unless the model has one
-    already.
+    already. The log has a warning if the best step was among the first tenth, or if the
+    model predicts an entity no better than that it does not move.
 
     With ``checkpoint``, an interrupted call resumes where it stopped when it is
     repeated, and ends with the same weights, bit for bit, as an uninterrupted one. A
@@ -67,6 +75,11 @@ def fit_world_model(
             after another. Trajectories of different data sets are distinct.
 
     Keyword Args:
+        action_spec (Bounded, optional): the action space, ``[A]``, which is recorded in
+            the model and from which :class:`~torchrl_caiac.influence.CAI` draws
+            actions. Defaults to the bounds that are stored with the data
+            (:func:`~torchrl_caiac.data.action_bounds`) or, with a warning, to the
+            range of the data.
         steps (int): the number of gradient steps in total. Defaults to ``100_000``.
         batch_size (int): transitions in each step. Defaults to ``500``.
         lr (float): the learning rate. Defaults to ``8e-4``.
@@ -103,17 +116,20 @@ def fit_world_model(
         KeyError: a key is missing in the data.
         ValueError: an argument is out of range; the data are empty, contain NaN or
             infinite values, do not fit the model, or have fewer than two trajectories;
-            the checkpoint is truncated, or was made with other settings or data.
+            an action is outside of its bounds by more than 1e-4 of their width; bounds
+            of several data sets differ; the checkpoint is truncated, or was made with
+            other settings or data.
         RuntimeError: the loss is not finite.
         DatasetError: the check found errors.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
         >>> from torchrl_caiac import EntityLayout
         >>> from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
         >>> from torchrl_caiac.fit import fit_world_model
-        >>> observation, action = torch.randn(200, 2), torch.randn(200, 1)
+        >>> observation, action = torch.randn(200, 2), 2 * torch.rand(200, 1) - 1
         >>> td = TensorDict(
         ...     {
         ...         "observation": observation,
@@ -125,8 +141,8 @@ def fit_world_model(
         ... )
         >>> model = GaussianWorldModel(EntityLayout({"arm": [0], "cup": [1]}), 1, (16,))
         >>> history = fit_world_model(
-        ...     model, td, steps=40, eval_every=20, batch_size=32, progress=False
-        ... )
+        ...     model, td, action_spec=Bounded(-1, 1, (1,)), steps=40, eval_every=20,
+        ...     batch_size=32, progress=False)
         >>> history["step"], history["validation_mse", "cup"].shape
         (tensor([20, 40]), torch.Size([2]))
     """
@@ -146,7 +162,9 @@ def fit_world_model(
             f"validation_fraction must be between 0 and 1, got {validation_fraction!r}"
         )
     sources = [data] if isinstance(data, TensorDictBase) else list(data)
-    rows = _Rows(model, sources, max_memory)
+    bounds = known_bounds(sources, action_spec, model.action_dim)
+    rows = _Rows(model, sources, max_memory, bounds)
+    low, high = filled_bounds(rows.action_range, bounds, model.action_key)
     generator = torch.Generator().manual_seed(seed)
     key = as_key(trajectory_key)
     train, validation = _split(
@@ -166,6 +184,7 @@ def fit_world_model(
                 "model": model.config,
                 "data_rows": rows.lengths,
                 "data_checksum": rows.checksum,
+                "action_bounds": bounds and [bound.tolist() for bound in bounds],
                 "batch_size": batch_size,
                 "lr": lr,
                 "validation_fraction": validation_fraction,
@@ -184,6 +203,7 @@ def fit_world_model(
             _LOGGER.info("resuming at step %d of %s", fit.step, keeper.path)
     if not model.fitted:
         model.fit_statistics(rows.raw_targets(train))
+    model.set_action_bounds(low, high)
 
     model.train()
     bar = tqdm(
@@ -218,6 +238,7 @@ def fit_world_model(
                 keeper.save(fit.step)
     model.load_state_dict(fit.best)
     model.eval()
+    _log_quality(fit, rows, validation)
     return fit.table()
 
 
@@ -249,8 +270,9 @@ class _Rows:
         model: EntityDynamicsModel,
         sources: Sequence[TensorDictBase],
         max_memory: int,
+        bounds: tuple[torch.Tensor, torch.Tensor] | None,
     ) -> None:
-        self.model, self.sources = model, sources
+        self.model, self.sources, self.bounds = model, sources, bounds
         for td in sources:
             if td.batch_dims != 1:
                 raise ValueError(
@@ -269,7 +291,16 @@ class _Rows:
         if total * width * 4 <= max_memory:
             self.block = torch.empty(total, width)
         self.checksum = 0
+        self.action_range = (
+            torch.full((model.action_dim,), math.inf),
+            torch.full((model.action_dim,), -math.inf),
+        )
         for first, part in self._chunks():
+            action = part.split(self.sizes, 1)[1]
+            self.action_range = (
+                torch.minimum(self.action_range[0], action.amin(0)),
+                torch.maximum(self.action_range[1], action.amax(0)),
+            )
             self.checksum = zlib.crc32(part.numpy().data, self.checksum)
             if self.block is not None:
                 self.block[first : first + len(part)] = part
@@ -304,6 +335,10 @@ class _Rows:
                 model.check_finite(state, first_row=first)
                 model.check_finite(after, next=True, first_row=first)
                 model.check_finite_action(action, first_row=first)
+                if self.bounds is not None:
+                    check_actions(
+                        action, *self.bounds, model.action_key, first_row=first
+                    )
                 yield first, self._columns(state, action, after)
                 first += len(part)
 
@@ -313,9 +348,9 @@ class _Rows:
         # The change is computed before the cast, to keep small changes of float64 data.
         state, action, after = state.cpu(), action.cpu(), after.cpu()
         index = self.model.index.cpu()
-        raw = after[:, index]
+        raw = floating(after[:, index])
         if self.model.target == "change":
-            raw = raw - state[:, index]
+            raw = raw - floating(state[:, index])
         return torch.cat([state.float(), action.float(), raw.float()], 1)
 
     def get(self, index: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -432,6 +467,42 @@ class _Fit:
         self.train_sum.copy_(state["train_sum"])
         for name in ("best", "best_nll", "history", "train_count"):
             setattr(self, name, state[name])
+
+
+@torch.no_grad()
+def _log_quality(fit: _Fit, rows: _Rows, validation: torch.Tensor) -> None:
+    """Logs a warning if the model overfits, or is no better than no motion."""
+    model = fit.model
+    best = [row for row in fit.history if row["best"]][-1]
+    if best["step"] <= 0.1 * fit.step:
+        _LOGGER.warning(
+            "the best step was %d of %d: the model overfits after it. Collect more "
+            "data, make the model smaller, or lower steps",
+            best["step"],
+            fit.step,
+        )
+    change = torch.zeros(model.predict_dim, dtype=torch.float64)
+    for part in validation.split(_CHUNK):
+        state, _, raw = rows.get(part)
+        if model.target != "change":
+            raw = raw - state[:, model.index]
+        change += raw.double().square().sum(0).cpu()
+    change /= len(validation)
+    # Changes below the floor count as noise, which no model predicts.
+    floor = model.floor.cpu().square()
+    still = [
+        name
+        for name, where in model.predicted.items()
+        if change[where].mean() > floor[where].mean()
+        and best[f"mse/{name}"] >= change[where].mean()
+    ]
+    if still:
+        _LOGGER.warning(
+            "the model predicts %s no better than that nothing moves: its scores "
+            "are not reliable. Fit more steps, or check that the data have the "
+            "actions that cause the next states",
+            still,
+        )
 
 
 def _copy(state: dict[str, Any]) -> dict[str, Any]:

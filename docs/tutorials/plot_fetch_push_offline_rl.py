@@ -17,6 +17,7 @@ import tempfile
 
 import matplotlib.pyplot as plt
 import torch
+from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate
 
 from torchrl_caiac import CAIACTransform
@@ -149,7 +150,14 @@ model = GaussianWorldModel(
     predict={name: layout.columns[name][:n] for name, n in positions.items()},
     variance_floor=1e-3,
 )
-history = fit_world_model(model, data, steps=2000, eval_every=1000, progress=False)
+history = fit_world_model(
+    model,
+    data,
+    action_spec=Bounded(-1.0, 1.0, (4,)),
+    steps=2000,
+    eval_every=1000,
+    progress=False,
+)
 print("steps:", history["step"].tolist())
 for name in positions:
     error = 1e3 * history["validation_mse", name].sqrt()

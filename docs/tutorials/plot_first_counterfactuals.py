@@ -11,7 +11,7 @@ result is a transition that was never recorded, but could have been.
 import matplotlib.pyplot as plt
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer
 
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.fit import fit_world_model
@@ -99,12 +99,19 @@ layout
 # -------------------------
 # The model predicts a Gaussian for the change of every entity. ``variance_floor`` is
 # its smallest standard deviation, in metres. Changes well below it count as noise.
+# ``action_spec`` says which actions are possible: influence compares them.
 
 model = GaussianWorldModel(
     layout, action_dim=2, hidden_sizes=(128, 128), variance_floor=5e-3
 )
 history = fit_world_model(
-    model, data, steps=2000, batch_size=500, eval_every=500, progress=False
+    model,
+    data,
+    action_spec=Bounded(-1.0, 1.0, (2,)),
+    steps=2000,
+    batch_size=500,
+    eval_every=500,
+    progress=False,
 )
 print("steps:", history["step"].tolist())
 print("validation NLL:", [round(x, 2) for x in history["validation_nll"].tolist()])

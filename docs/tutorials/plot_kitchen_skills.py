@@ -19,7 +19,7 @@ from dataclasses import replace
 import torch
 from minari import MinariDataset
 from tensordict import TensorDict
-from torchrl.data import SliceSampler, TensorDictReplayBuffer
+from torchrl.data import Bounded, SliceSampler, TensorDictReplayBuffer
 
 from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import offline_buffer
@@ -99,7 +99,12 @@ random = kitchen_transitions(
 )
 model = GaussianWorldModel(layout, action_dim=9, variance_floor=2e-3)
 history = fit_world_model(
-    model, [data, random], steps=1500, eval_every=500, progress=False
+    model,
+    [data, random],
+    action_spec=Bounded(-1.0, 1.0, (9,)),
+    steps=1500,
+    eval_every=500,
+    progress=False,
 )
 print("rows:", len(data), "of demonstrations,", len(random), "random")
 print("validation NLL:", [round(x, 2) for x in history["validation_nll"].tolist()])

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torchrl.data import Bounded
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
@@ -68,6 +69,11 @@ class Environment(ABC):
         self.settings = settings
         self.out = out
         self.workers = workers
+
+    @property
+    def action_spec(self) -> Bounded:
+        """The action space, ``[A]``: [-1, 1] in every dimension."""
+        return Bounded(-1.0, 1.0, (self.action_dim,))
 
     @property
     def folder(self) -> Path:

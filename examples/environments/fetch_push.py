@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from environments.base import Environment, Evaluation, compare_methods
 from torchrl_caiac.data import load_minari, load_transitions, mix_trajectories
+from torchrl_caiac.data.digests import data_digest, data_source
 from torchrl_caiac.envs.fetch_push import (
     FetchPushCubes,
     FetchPushTruth,
@@ -85,7 +86,14 @@ class FetchPush(Environment):
             (self.folder / "rows", ("expert", "random"), self.settings.fraction),
             (out / "held_out", ("held_out_expert", "held_out_random"), 1.0),
         ):
-            if not path.exists():
+            if path.exists():
+                mixed = {"mixed": [data_digest(out / name) for name in names]}
+                if data_source(path) != mixed:
+                    raise ValueError(
+                        f"{path} was mixed from other data than {names} in {out} have "
+                        "now: delete it, or set another folder with out=..."
+                    )
+            else:
                 mix_trajectories(
                     [load_transitions(out / name) for name in names],
                     shares=shares if fraction < 1 else None,

@@ -13,6 +13,7 @@ from torchrl.data import ReplayBuffer
 
 from environments.base import Environment
 from methods.base import Method
+from torchrl_caiac.data.digests import content_digests
 
 __all__ = ["Learner"]
 
@@ -48,8 +49,8 @@ class Learner(ABC):
         self.augmentation = augmentation
         self.parts: dict[str, Any] = {}
 
-    def kept_settings(self) -> dict[str, Any]:
-        """Returns what the results of a run depend on."""
+    def kept_settings(self, seed: int) -> dict[str, Any]:
+        """Returns what the results of a run depend on: settings, data and scores."""
         settings: dict[str, Any] = OmegaConf.to_container(self.settings, resolve=True)
         if self.extendable:
             settings.pop("steps")
@@ -57,6 +58,9 @@ class Learner(ABC):
             **settings,
             "method": {"class": type(self.method).__name__, **vars(self.method)},
             "augmentation": OmegaConf.to_container(self.augmentation, resolve=True),
+            "seed": seed,
+            "layout": self.environment.layout.to_dict(),
+            "data": content_digests(self.environment.rows(), self.method.score_key),
         }
 
     def rows(self) -> TensorDictBase:

@@ -30,7 +30,11 @@ class CAIAC(Method):
     def estimator(self, scoring: Scoring) -> Estimator:
         """Returns CAI of the Gaussian world model."""
         model = scoring.model("world_model")
-        return CAI(model, num_actions=scoring.settings.num_actions)
+        return CAI(
+            model,
+            num_actions=scoring.settings.num_actions,
+            action_spec=scoring.environment.action_spec,
+        )
 
     def transform(
         self, layout: EntityLayout, counterfactual_ratio: float = 0.5, **options: Any

@@ -1,4 +1,4 @@
-"""The settings that results were made with, stored next to them."""
+"""What results were made with, settings and digests of data, stored next to them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl_caiac._files import plain, write_json
 
-__all__ = ["keep_settings"]
+__all__ = ["check_settings", "keep_settings"]
 
 
 def keep_settings(
@@ -23,7 +23,8 @@ def keep_settings(
     Args:
         folder (path): the folder with the results.
         step (str): the name of the step.
-        settings (Mapping): what the results depend on, for example a ``DictConfig``.
+        settings (Mapping): what the results depend on, for example a ``DictConfig``,
+            and digests of the data.
 
     Raises:
         ValueError: the results were made with other settings.
@@ -35,9 +36,38 @@ def keep_settings(
         ...     keep_settings(folder, "train", {"lr": 0.1})
     """
     path = Path(folder) / f"{step}.json"
-    if not path.exists():
+    if path.exists():
+        check_settings(folder, step, settings)
+    else:
         write_json(path, settings)
-        return
+
+
+def check_settings(
+    folder: str | os.PathLike[str], step: str, settings: Mapping[str, Any]
+) -> None:
+    """Compares settings with those that :func:`keep_settings` wrote.
+
+    Args:
+        folder (path): the folder with the results.
+        step (str): the name of the step.
+        settings (Mapping): what the results depend on.
+
+    Raises:
+        FileNotFoundError: the step was not begun in this folder.
+        ValueError: the results were made with other settings.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     keep_settings(folder, "train", {"lr": 0.1})
+        ...     check_settings(folder, "train", {"lr": 0.1})
+    """
+    path = Path(folder) / f"{step}.json"
+    if not path.exists():
+        raise FileNotFoundError(
+            f"there is no {path}: run the step {step!r} first, or set the folder of "
+            "the results with out=..."
+        )
     try:
         kept = json.loads(path.read_text())
     except ValueError as error:

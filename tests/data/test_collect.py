@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import textwrap
 import traceback
+from functools import partial
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from tests.killing import run_killed
+from tests.mutations import mutate_file
+from torchrl_caiac._files import UnreadableFileError, whole_file
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
 
 TOY = """
@@ -238,3 +244,72 @@ def test_record_episode(terminate_at, stop, length, terminated):
 def test_record_episode_needs_steps():
     with pytest.raises(ValueError, match="max_steps is 0"):
         record_episode(Counter(), lambda o: o, {}, max_steps=0)
+
+
+@settings(max_examples=200)
+@given(st.randoms(use_true_random=False))
+def test_a_damaged_episode_is_read_or_refused_by_name(tmp_path_factory, rng):
+    folder = tmp_path_factory.mktemp("damaged")
+    report = collect_episodes(
+        lambda: lambda spec, seed: {"a": {"b": np.zeros(spec["n"])}},
+        [{"n": 3}],
+        folder,
+        workers=1,
+        progress=False,
+    )
+    (file,) = report.files
+    mutate_file(file, rng)
+    try:
+        load_episode(file)
+    except (UnreadableFileError, FileNotFoundError) as error:
+        assert str(file) in str(error)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "match"),
+    [
+        ({"a": np.zeros(1)}, "'meta' is missing"),
+        ({"meta": np.zeros(1)}, "not a text"),
+        ({"meta": np.array("[]")}, r"'meta' is \[\]"),
+        ({"meta": np.array('{"spec": 1, "seed": 1, "attempts": 1}')}, "'spec' is 1"),
+        ({"meta": np.array('{"spec": {}, "seed": 1.5, "attempts": 1}')}, "'seed' is"),
+        ({"meta": np.array('{"spec": {}, "seed": 1, "attempts": 0}')}, "'attempts' is"),
+    ],
+)
+def test_what_is_not_an_episode(arrays, match, tmp_path):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(UnreadableFileError, match=match):
+        load_episode(tmp_path / "a.npz")
+
+
+def test_an_entry_below_an_array_is_refused(tmp_path):
+    meta = np.array('{"spec": {}, "seed": 1, "attempts": 1}')
+    for names in (["a", "a/b"], ["a/b", "a"]):
+        np.savez(tmp_path / "a.npz", meta=meta, **dict.fromkeys(names, np.zeros(1)))
+        with pytest.raises(UnreadableFileError, match=r"a\.npz .*'a'"):
+            load_episode(tmp_path / "a.npz")
+
+
+def test_a_finished_collection_in_a_read_only_folder(toy, tmp_path, read_only):
+    call = partial(
+        collect_episodes, toy.factory, [{"steps": 3}], workers=1, progress=False
+    )
+    call(tmp_path / "work")
+    run_killed(half_a_file, tmp_path / "work" / "episode_000000.npz")
+    read_only(tmp_path / "work")
+    report = call(tmp_path / "work")
+    assert (report.collected, report.reused) == (0, 1)
+
+
+def test_what_a_killed_collection_left_is_removed(toy, tmp_path):
+    run_killed(half_a_file, tmp_path / "work" / "episode_000007.npz")
+    collect_episodes(
+        toy.factory, [{"steps": 3}], tmp_path / "work", workers=1, progress=False
+    )
+    assert not list((tmp_path / "work").glob(".partial-*"))
+
+
+def half_a_file(path):
+    with whole_file(path) as partial_file:
+        partial_file.write_text("half")
+        yield

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+from functools import partial
+
 import gymnasium
+import h5py
 import minari
 import numpy as np
 import pytest
@@ -9,8 +12,15 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 from torchrl.data import SliceSampler
 
+from tests.killing import run_killed
 from torchrl_caiac import EntityLayout
-from torchrl_caiac.data import load_minari, load_transitions, offline_buffer
+from torchrl_caiac._files import whole_folder
+from torchrl_caiac.data import (
+    action_bounds,
+    load_minari,
+    load_transitions,
+    offline_buffer,
+)
 from torchrl_caiac.influence import score_buffer
 
 LENGTHS = (4, 1, 6)
@@ -92,7 +102,9 @@ def _root(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
 
 
-def make_dataset(observe, lengths=LENGTHS, spoil=None, name="caiac/test-v0"):
+def make_dataset(
+    observe, lengths=LENGTHS, spoil=None, name="caiac/test-v0", actions=None
+):
     rng = np.random.default_rng(0)
     buffers = []
     for number, length in enumerate(lengths):
@@ -113,7 +125,7 @@ def make_dataset(observe, lengths=LENGTHS, spoil=None, name="caiac/test-v0"):
         name,
         buffer=buffers,
         observation_space=SPACES[observe],
-        action_space=spaces.Box(-1, 1, (2,), np.float64),
+        action_space=actions or spaces.Box(-1, 1, (2,), np.float64),
     ), buffers
 
 
@@ -279,6 +291,137 @@ def test_an_entry_named_as_a_key_of_transitions(observe, name, tmp_path):
     dataset, _ = make_dataset(observe)
     with pytest.raises(ValueError, match=rf"entries named \['{name}'\]"):
         load_minari(dataset, tmp_path / "rows", progress=False)
+
+
+def mission(rng: np.random.Generator, length: int) -> dict:
+    return {
+        "observation": arrays(rng, length + 1, 2),
+        "mission": ["push"] * (length + 1),
+        "deep": {"name": ["cup"] * (length + 1), "place": arrays(rng, length + 1, 1)},
+    }
+
+
+SPACES[mission] = spaces.Dict(
+    {
+        "observation": box(2),
+        "mission": spaces.Text(9),
+        "deep": spaces.Dict({"name": spaces.Text(9), "place": box(1)}),
+    }
+)
+
+
+def named_infos(number, buffer):
+    length = len(buffer.actions)
+    # Text of one length is stored as bytes, of several as objects.
+    buffer.infos["name"] = np.array([b"cup"] * (length + 1))
+    buffer.infos["deep"] = {
+        "label": np.array(["a" * i for i in range(length + 1)], dtype=object),
+        "size": np.arange(length + 1),
+    }
+
+
+class TestTextAndObjects:
+    @pytest.mark.parametrize(
+        ("exclude", "infos", "match"),
+        [
+            (["deep"], [], r"'mission' in episode 0 .* text, .*exclude=\['mission'\]"),
+            (["mission"], [], r"\('deep', 'name'\) in episode 0 .* text"),
+            (["mission", "deep"], ["name"], r"\('info', 'name'\) in .* bytes"),
+            (
+                ["mission", "deep"],
+                ["deep"],
+                r"\('info', 'deep', 'label'\) in .* Python objects",
+            ),
+        ],
+    )
+    def test_key_and_episode_are_named(self, exclude, infos, match, tmp_path):
+        dataset, _ = make_dataset(mission, spoil=named_infos)
+        options = {"exclude": exclude, "infos": infos, "progress": False}
+        with pytest.raises(ValueError, match=match):
+            load_minari(dataset, tmp_path / "rows", **options)
+        assert [path.name for path in tmp_path.iterdir()] == ["minari"]
+
+    def test_what_is_excluded_is_left_out(self, tmp_path):
+        dataset, _ = make_dataset(mission, spoil=named_infos)
+        rows = load_minari(
+            dataset,
+            tmp_path / "rows",
+            infos=["deep", "clock"],
+            exclude=["mission", ("deep", "name"), ("info", "deep", "label")],
+            progress=False,
+        )
+        keys = {key for key in rows.keys(True, True) if "next" not in key}
+        assert keys == {
+            "observation",
+            ("deep", "place"),
+            "action",
+            "episode",
+            ("info", "deep", "size"),
+            ("info", "clock"),
+        }
+        assert rows["next", "deep"].keys() == {"place"}
+
+    def test_an_unknown_entry_is_named(self, tmp_path):
+        dataset, _ = make_dataset(flat)
+        with pytest.raises(KeyError, match=r"no \[\('misson',\)\].*'observation'"):
+            load_minari(dataset, tmp_path / "x", exclude=["misson"], progress=False)
+
+
+class TestActionBounds:
+    def test_bounded_actions(self, tmp_path):
+        space = spaces.Box(np.array([-1.0, 0.1]), np.array([1.0, 2.0]), (2,))
+        dataset, _ = make_dataset(flat, actions=space)
+        rows = load_minari(dataset, tmp_path / "rows", progress=False)
+        low, high = action_bounds(rows)
+        assert torch.equal(low, torch.tensor([-1.0, 0.1]))
+        assert torch.equal(high, torch.tensor([1.0, 2.0]))
+
+    def test_unbounded_actions(self, tmp_path):
+        space = spaces.Box(np.array([-1.0, -np.inf]), np.ones(2), (2,), np.float64)
+        dataset, _ = make_dataset(flat, actions=space)
+        rows = load_minari(dataset, tmp_path / "rows", progress=False)
+        assert action_bounds(rows) is None
+
+
+class TestDigests:
+    def test_leaves_and_source_have_them(self, tmp_path, caplog):
+        make_dataset(flat)
+        load = partial(load_minari, "caiac/test-v0", tmp_path / "rows", progress=False)
+        load()
+        load_transitions(tmp_path / "rows", verify=True)
+        load(overwrite=True)
+        assert "other data" not in caplog.text
+        (file,) = (tmp_path / "minari").rglob("main_data.hdf5")
+        with h5py.File(file, "r+") as stored:
+            stored["episode_1/rewards"][0] += 1
+        load(overwrite=True)
+        assert "other data than those of caiac/test-v0" in caplog.text
+
+    def test_a_read_only_dataset(self, tmp_path, read_only):
+        make_dataset(flat)
+        read_only(tmp_path / "minari")
+        rows = load_minari("caiac/test-v0", tmp_path / "rows", progress=False)
+        assert len(rows) == sum(LENGTHS)
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path, small_disk):
+    dataset, _ = make_dataset(flat, lengths=(60_000, 60_000))
+    with pytest.raises(OSError, match=r"the disk is full: .*\.memmap needs \d+ bytes"):
+        load_minari(dataset, small_disk / "rows", progress=False)
+    assert not list(small_disk.iterdir())
+
+
+def test_what_a_killed_call_left_is_removed(tmp_path):
+    dataset, _ = make_dataset(flat)
+
+    def half():
+        with whole_folder(tmp_path / "rows") as folder:
+            folder.mkdir()
+            yield
+
+    run_killed(half)
+    load_minari(dataset, tmp_path / "rows", progress=False)
+    assert {path.name for path in tmp_path.iterdir()} == {"minari", "rows"}
 
 
 def test_arguments(tmp_path):

@@ -1,11 +1,19 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from tests.mutations import mutate_file
+from torchrl_caiac._files import safe_meta
+from torchrl_caiac.data import UnreadableFileError
+from torchrl_caiac.data.digests import write_digests
 from torchrl_caiac.data.load_transitions import load_transitions
 
 
@@ -70,7 +78,7 @@ def test_a_missing_file(name, tmp_path):
 def test_a_foreign_meta_file(text, tmp_path):
     rows().memmap(tmp_path / "data")
     (tmp_path / "data/meta.json").write_text(text)
-    with pytest.raises(ValueError, match="truncated or not from tensordict"):
+    with pytest.raises(ValueError, match=r"meta.json is .*truncated"):
         load_transitions(tmp_path / "data")
 
 
@@ -163,3 +171,124 @@ def test_another_class_is_refused(tmp_path):
     change_meta(tmp_path / "data/next", lambda meta: meta.update(_type=kind))
     with pytest.raises(ValueError, match=r"next.meta.json describes a .*NonTensorData"):
         load_transitions(tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"device": "cuda:0"},
+        {"device": "meta"},
+        {"action": "torch.float32"},
+        {"action": None},
+        {"device": None},
+    ],
+)
+def test_no_entry_is_left_out_or_moved_without_a_word(change, tmp_path):
+    rows().memmap(tmp_path / "data")
+    change_meta(tmp_path / "data", lambda meta: meta.update(change))
+    with pytest.raises(UnreadableFileError, match=r"meta\.json"):
+        load_transitions(tmp_path / "data")
+
+
+def test_an_inner_batch_size_must_begin_with_the_outer_one(tmp_path):
+    rows().memmap(tmp_path / "data")
+    change_meta(tmp_path / "data/next", lambda meta: meta.update(shape=[3]))
+    with pytest.raises(UnreadableFileError, match=r"next/meta\.json.*batch size \[6\]"):
+        load_transitions(tmp_path / "data")
+
+
+def test_what_is_not_a_file_is_not_opened(tmp_path):
+    rows().memmap(tmp_path / "data")
+    file = tmp_path / "data" / "action.memmap"
+    file.unlink()
+    os.mkfifo(file)  # opening it would wait forever
+    with pytest.raises(UnreadableFileError, match=r"action\.memmap"):
+        load_transitions(tmp_path / "data")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "data"
+    rows().memmap(folder)
+    write_digests(folder)
+    return folder
+
+
+@settings(max_examples=300)
+@given(st.randoms(use_true_random=False))
+def test_a_damaged_folder_is_read_whole_or_refused_by_name(whole, rng):
+    folder = whole.with_name("damaged")
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(whole, folder)
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    mutate_file(rng.choice(files), rng)
+    for verify in (False, True):
+        try:
+            loaded = load_transitions(folder, verify=verify)
+        except (UnreadableFileError, FileNotFoundError) as error:
+            assert str(folder) in str(error)
+            continue
+        except ValueError as error:  # readable, but not flat transitions
+            assert str(folder) in str(error)
+            assert "batch size" in str(error) or "lacks" in str(error)
+            continue
+        assert all(leaf.shape[0] == 6 for leaf in loaded.values(True, True))
+        if verify:
+            digests = json.loads((folder / "digests.json").read_text())["sha256"]
+            expected = load_transitions(whole)
+            for key in loaded.keys(True, True):
+                if (
+                    f"{'/'.join(key) if isinstance(key, tuple) else key}.memmap"
+                    in digests
+                ):
+                    same = loaded[key].flatten().view(torch.uint8)
+                    assert torch.equal(same, expected[key].flatten().view(torch.uint8))
+
+
+class TestVerify:
+    def test_one_flipped_bit_is_noticed(self, tmp_path):
+        rows().memmap(tmp_path)
+        write_digests(tmp_path)
+        load_transitions(tmp_path, verify=True)
+        file = tmp_path / "next" / "observation.memmap"
+        content = bytearray(file.read_bytes())
+        content[11] ^= 4
+        file.write_bytes(content)
+        load_transitions(tmp_path)
+        with pytest.raises(
+            UnreadableFileError, match=r"next/observation\.memmap chang"
+        ):
+            load_transitions(tmp_path, verify=True)
+
+    def test_leaves_may_be_added(self, tmp_path):
+        rows().memmap(tmp_path)
+        write_digests(tmp_path)
+        loaded = load_transitions(tmp_path)
+        loaded.make_memmap(("caiac", "score"), shape=[6, 2]).fill_(3.0)
+        assert ("caiac", "score") in load_transitions(tmp_path, verify=True).keys(True)
+
+    def test_without_digests_there_is_nothing_to_verify(self, tmp_path):
+        rows().memmap(tmp_path)
+        with pytest.raises(FileNotFoundError, match=r"no digests\.json"):
+            load_transitions(tmp_path, verify=True)
+
+
+def test_a_killed_addition_of_a_leaf_is_undone(tmp_path, caplog):
+    rows().memmap(tmp_path)
+    data = load_transitions(tmp_path)
+    guard = safe_meta(tmp_path)
+    guard.__enter__()  # and never leaves, as in a killed process
+    data.make_memmap(("caiac", "score"), shape=[6, 2])
+    (tmp_path / "caiac" / "meta.json").write_text("")
+    assert ("caiac", "score") not in load_transitions(tmp_path).keys(True)
+    assert "without that leaf" in caplog.text
+
+
+def test_a_read_only_folder_is_read(read_only, tmp_path):
+    rows().memmap(tmp_path / "data")
+    write_digests(tmp_path / "data")
+    read_only(tmp_path / "data")
+    with pytest.raises(OSError, match=r"(?i)read-only|denied"):
+        (tmp_path / "data" / "new").touch()
+    loaded = load_transitions(tmp_path / "data", verify=True)
+    assert loaded["observation"].shape == (6, 3)

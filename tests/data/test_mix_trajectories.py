@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import NonTensorData, TensorDict
 
-from torchrl_caiac.data import load_transitions, mix_trajectories, offline_buffer
+from torchrl_caiac.data import (
+    action_bounds,
+    load_transitions,
+    mix_trajectories,
+    offline_buffer,
+)
+from torchrl_caiac.data.digests import data_digest, data_source
+from torchrl_caiac.data.write_transitions import write_transitions
 
 
 def source(lengths, *, first_id=0, id_shape=(), seed=0):
@@ -282,5 +289,40 @@ def test_bad_sources():
     with pytest.raises(ValueError, match="7 of source 1 are not consecutive"):
         mix_trajectories([good, torch.cat([good, good[:2]])])
     named = source([2]).set("name", NonTensorData("expert", [2]))
-    with pytest.raises(ValueError, match=r"'name' of source 0 is not a tensor"):
+    with pytest.raises(ValueError, match=r"'name' of source 0 is a NonTensorData"):
         mix_trajectories([named])
+
+
+class TestFolders:
+    def test_a_full_disk_is_an_error_and_leaves_nothing(self, small_disk):
+        big = source([60_000, 60_000])
+        with pytest.raises(OSError, match=r"the disk is full: .*\.memmap needs \d+"):
+            mix_trajectories([big], path=small_disk / "mixed")
+        assert not list(small_disk.iterdir())
+
+    def test_digests_are_written(self, tmp_path):
+        stored = write_transitions(source([3, 2]), tmp_path / "source")
+        mix_trajectories([stored, source([4])], path=tmp_path / "mixed")
+        load_transitions(tmp_path / "mixed", verify=True)
+        digest = data_digest(tmp_path / "source")
+        assert data_source(tmp_path / "mixed") == {"mixed": [digest, None]}
+
+    @pytest.mark.parametrize(
+        ("bounds", "kept"),
+        [
+            ([([-1, -1], [1, 1])] * 2, True),
+            ([([-1, -1], [1, 1]), ([-1, -1], [1, 2])], False),
+            ([([-1, -1], [1, 1]), None], False),
+            ([None, None], False),
+        ],
+    )
+    def test_action_bounds_are_kept_where_all_agree(self, bounds, kept, tmp_path):
+        sources = [
+            write_transitions(source([3]), tmp_path / f"{number}", action_bounds=pair)
+            for number, pair in enumerate(bounds)
+        ]
+        mixed = mix_trajectories(sources, path=tmp_path / "mixed")
+        found = action_bounds(mixed)
+        assert (found is not None) is kept
+        if kept:
+            assert found[0].tolist() == [-1, -1] and found[1].tolist() == [1, 1]

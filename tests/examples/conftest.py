@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study")
 SCRIPTS += ("compare_influence", "compare_precision")
-SHARED = ("console", "parts", "settings", "tables")
+SHARED = ("console", "log", "parts", "settings", "tables")
 SMALL_ENV = {
     "kitchen": {
         "collect": {"episodes": 2, "held_out": 1},

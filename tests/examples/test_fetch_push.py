@@ -142,12 +142,14 @@ def test_an_interrupted_training_ends_as_one_that_was_not(cfg, steps, monkeypatc
     kept = train.load_policy(cfg, "caiac", 3, 12).state_dict()
     for key, value in policy.items():
         torch.testing.assert_close(kept[key], value, rtol=0, atol=0)
-    # Means over the steps since the last log, or since the run resumed at step 6.
-    (path,) = folder.rglob("share_relabeled.csv")
-    logged = [line.split(",") for line in path.read_text().split()]
-    assert [int(step) for step, _ in logged] == [4, 8, 8, 12]
-    for _, mean in logged:
-        assert float(mean) == pytest.approx(0.5, abs=0.2)
+    # The log too, byte for byte.
+    files = list((folder / "log").rglob("*.csv"))
+    assert len(files) > 4
+    for file in files:
+        there = folder.with_name("whole") / file.relative_to(folder)
+        assert file.read_text() == there.read_text()
+        lines = [line.split(",")[0] for line in file.read_text().split()]
+        assert lines == ["4", "8", "12"]
 
 
 def test_kept_policies_are_those_of_the_loss(cfg, environment, steps):
@@ -202,10 +204,67 @@ def test_other_settings_are_not_mixed(cfg, steps):
         other = steps.study.OmegaConf.merge(cfg, change)
         with pytest.raises(ValueError, match=f"other settings.*{name}.* differ"):
             steps.train.train(other, "caiac", seed=1)
+        with pytest.raises(ValueError, match=f"other settings.*{name}.* differ"):
+            steps.train.load_policy(other, "caiac", 1, 12)
+        with pytest.raises(ValueError, match=f"other settings.*{name}.* differ"):
+            steps.evaluate.evaluate(other, "caiac", 1)
     other = cfg.copy()
     other.env.truth.threshold = 0.01
     with pytest.raises(ValueError, match=r"other settings.*truth\.json"):
         steps.score.score(other)
+
+
+@pytest.mark.parametrize(
+    ("key", "name"),
+    [
+        ("observation", r"data\.(0\.)?observation"),
+        (("caiac", "score"), r"data\.caiac\.score"),
+    ],
+)
+def test_other_data_are_not_mixed(key, name, cfg, environment, steps):
+    steps.train.train(cfg, "caiac", seed=12)
+    steps.train.train(cfg, "caiac", seed=12)
+    value = environment.rows()[key][7, 1:2]
+    before = value.clone()
+    value += 0.25
+    others = [(steps.train.train, (cfg, "caiac", 12))]
+    others.append((steps.train.load_policy, (cfg, "caiac", 12, 12)))
+    others.append((steps.evaluate.evaluate, (cfg, "caiac", 12)))
+    if key == "observation":
+        others.append((steps.fit.fit_model, (cfg, "world_model")))
+        others.append((steps.score.score, (cfg,)))
+    try:
+        for step, args in others:
+            with pytest.raises(ValueError, match=rf"other settings.*{name}"):
+                step(*args)
+        if key == "observation":
+            return
+        # The scores of another method are no part of the data of this one.
+        steps.train.train(cfg, "oracle", seed=12)
+    finally:
+        value.copy_(before)
+    steps.train.train(cfg, "caiac", seed=12)
+
+
+def test_another_policy_is_not_taken_for_the_one_that_played(cfg, steps):
+    steps.train.train(cfg, "none", seed=13)
+    steps.evaluate.evaluate(cfg, "none", 13)
+    policy = steps.parts.policy_file(cfg, "none", 13, 8)
+    policy.write_bytes(steps.parts.policy_file(cfg, "none", 13, 12).read_bytes())
+    with pytest.raises(ValueError, match=r"policy-8\.json.*sha256"):
+        steps.evaluate.evaluate(cfg, "none", 13)
+
+
+def test_rows_mixed_from_other_episodes_are_refused(cfg, environment, steps):
+    file = environment.out / "random" / "digests.json"
+    content = file.read_text()
+    digest = json.loads(content)["sha256"]["action.memmap"]
+    file.write_text(content.replace(digest, digest[::-1]))
+    try:
+        with pytest.raises(ValueError, match=r"rows was mixed from other data"):
+            steps.collect.collect(cfg)
+    finally:
+        file.write_text(content)
 
 
 def test_the_study(cfg, steps, compose, tmp_path, monkeypatch, capfd):

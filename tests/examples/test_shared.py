@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import csv
 import doctest
 import os
@@ -9,6 +10,7 @@ from itertools import product
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
@@ -154,3 +156,49 @@ def test_a_script_claims_its_folder(steps, compose, tmp_path):
         steps.console.start(cfg),
     ):
         pass
+
+
+class TestScalarLog:
+    def log(self, steps, folder, *, until, since=0, state=None):
+        log = steps.log.ScalarLog("csv", folder)
+        if state is not None:
+            log.load_state_dict(state)
+        log.resume(since)
+        states = {}
+        for step in range(since + 1, until + 1):
+            log.add({"loss": torch.tensor(float(step)), "q": torch.tensor(0.1 * step)})
+            if step % 3 == 0:
+                log.write(step)
+            states[step] = copy.deepcopy(log.state_dict())
+        return states
+
+    def contents(self, folder):
+        return {file.name: file.read_bytes() for file in folder.rglob("*.csv")}
+
+    @settings(max_examples=30)
+    @given(st.integers(0, 10), st.integers(0, 12), st.booleans())
+    def test_an_interrupted_log_is_that_of_one_run(
+        self, steps, saved, killed, half_a_line
+    ):
+        killed = max(saved, killed)
+        with tempfile.TemporaryDirectory() as folder:
+            whole, other = Path(folder, "whole"), Path(folder, "other")
+            self.log(steps, whole, until=12)
+            states = self.log(steps, other, until=killed)
+            if half_a_line and killed > saved and killed >= 3:
+                with (other / "log/scalars/loss.csv").open("a") as file:
+                    file.write("1")
+            state = states.get(saved)
+            self.log(steps, other, since=saved, until=12, state=state)
+            assert self.contents(other) == self.contents(whole) != {}
+
+    def test_means(self, steps, tmp_path):
+        self.log(steps, tmp_path, until=6)
+        content = (tmp_path / "log/scalars/loss.csv").read_text()
+        assert content == "3,2.0\n6,5.0\n"
+
+
+def test_settings_that_were_never_kept(steps, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no .*train\.json: run the step"):
+        steps.settings.check_settings(tmp_path, "train", {})
+    assert not list(tmp_path.iterdir())

@@ -35,6 +35,13 @@ class Graph(Read):
         return x[:, None, :] * torch.ones(4, 1) + td["action"][:, :1, None]
 
 
+def ready(model):
+    """Has a world model count as fitted: unit variances, actions in [-1, 1]."""
+    model.fit_statistics(torch.tensor([[-1.0], [1.0]]).expand(2, model.predict_dim))
+    model.set_action_bounds(-1.0, 1.0)
+    return model
+
+
 class Failing(Read):
     """Is interrupted at call number ``calls``; its settings are those of ``Read``."""
 

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Unbounded
 
 from tests.influence.plain_influence import plain_influence
+from tests.influence.scoring import ready
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.influence import (
     CAI,
@@ -34,7 +35,7 @@ def trained(**kwargs: Any) -> GaussianWorldModel:
     torch.manual_seed(0)
     model = GaussianWorldModel(LAYOUT, 2, (16, 16), **kwargs)
     model.forward_tensors(torch.randn(100, 5), torch.rand(100, 2) * 2 - 1)
-    return model
+    return ready(model)
 
 
 def states(*batch: int, dtype: Any = torch.float32) -> TensorDict:
@@ -100,6 +101,7 @@ def test_nested_layout() -> None:
     other = GaussianWorldModel(layout, 2, (16, 16), widths=layout.widths(td))
     values = {k: v for k, v in model.state_dict().items() if "extra" not in k}
     other.load_state_dict({**values, "_extra_state": other.get_extra_state()})
+    ready(other)
     torch.testing.assert_close(CAI(other)(td), CAI(model)(flat))
     assert CAI(other)(td.reshape(2, 3)).shape == (2, 3, 2)
 
@@ -198,7 +200,10 @@ torch.set_num_threads(1)
 
 def score(rows, entities, actions, hidden):
     layout = EntityLayout({f"e{i}": [2 * i, 2 * i + 1] for i in range(entities)})
-    estimator = CAI(GaussianWorldModel(layout, 2, (hidden,)), num_actions=actions)
+    model = GaussianWorldModel(layout, 2, (hidden,))
+    model.fit_statistics(torch.ones(1, model.predict_dim))
+    model.set_action_bounds(-1.0, 1.0)
+    estimator = CAI(model, num_actions=actions)
     td = TensorDict({"observation": torch.zeros(rows, 2 * entities)}, [rows])
     estimator(td)
 
@@ -287,7 +292,7 @@ def gated() -> GaussianWorldModel:
         model.hidden[0].weight[0, 5] = 1.0
         model.hidden[0].bias.fill_(-99.0)
         model.loc_head.weight[2, 0] = 3.0
-    return model
+    return ready(model)
 
 
 def gates(rows: int, near: float) -> TensorDict:
@@ -354,7 +359,7 @@ def test_fast_mode_falls_back_if_its_masks_are_wrong(
 
 def test_fixed_entities_do_not_count_as_near() -> None:
     layout = EntityLayout(LAYOUT.columns, fixed=("cup",))
-    model = GaussianWorldModel(layout, 2, (1,))
+    model = ready(GaussianWorldModel(layout, 2, (1,)))
     fast = CAI(model, mode="fast", threshold=0.1)
     scores = torch.tensor([[0.0, 0.1], [0.1, 0.0], [0.3, 0.3]])
     assert fast._any_within(scores, (0.05, 0.2)).tolist() == [False, True, False]
@@ -391,3 +396,50 @@ def test_repr_separates_modes() -> None:
         CAI(model, mode="fast", threshold=0.1, compile=True)
     )
     assert repr(CAI(model)) == repr(CAI(model, compile=True))
+
+
+# --- the bounds of the actions -------------------------------------------------------
+
+
+def test_a_model_that_was_never_fitted_is_refused() -> None:
+    with pytest.raises(ValueError, match="the model was never fitted"):
+        CAI(GaussianWorldModel(LAYOUT, 2, (16, 16)))
+
+
+def test_actions_are_drawn_from_the_bounds_that_the_model_recorded() -> None:
+    model = trained()
+    model.set_action_bounds([-90.0, 0.0], [90.0, 0.01])
+    twin = GaussianWorldModel.from_config(model.config)
+    twin.load_state_dict(model.state_dict())
+    for one in (model, twin):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            actions = CAI(one, num_actions=500).actions
+        assert -90 <= actions[:, 0].min() < -85 and 85 < actions[:, 0].max() <= 90
+        assert 0 <= actions[:, 1].min() < 0.001 and 0.009 < actions[:, 1].max() <= 0.01
+
+
+def test_unknown_bounds_and_other_bounds_are_warned_of() -> None:
+    model = trained()
+    unknown = GaussianWorldModel(LAYOUT, 2, (16, 16))
+    unknown.fit_statistics(torch.ones(1, 5))
+    with pytest.warns(UserWarning, match=r"not known, .* drawn from \[-1, 1\]"):
+        actions = CAI(unknown).actions
+    assert torch.equal(actions, CAI(model).actions)
+    for low, high, warns in (
+        (-1.0, 1.0, False),
+        (-0.8, 1.0, False),
+        (-0.6, 0.6, True),
+        (-1.1, 1.0, True),
+        (-90.0, 90.0, True),
+    ):
+        spec = Bounded(torch.tensor([-1.0, low]), torch.tensor([1.0, high]), (2,))
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            actions = CAI(model, num_actions=500, action_spec=spec).actions
+        assert (actions[:, 1] >= low).all() and (actions[:, 1] <= high).all()
+        assert len(found) == warns
+        if warns:
+            assert f"[-1, 1] x [{low:g}, {high:g}]" in str(found[0].message)
+            assert "[-1, 1] x [-1, 1]" in str(found[0].message)
+            assert "columns [1]" in str(found[0].message)

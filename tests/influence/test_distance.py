@@ -104,3 +104,12 @@ def test_rejects_positions_that_are_not_finite() -> None:
     rule = DistanceInfluence(LAYOUT, PLACES)
     with pytest.raises(ValueError, match=r"positions of \['cup'\] have NaN"):
         rule(TensorDict({"observation": x}, [2]))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int64])
+def test_integers_do_not_wrap_around(dtype: torch.dtype) -> None:
+    layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
+    rule = DistanceInfluence(layout, {"arm": [0], "cup": [1]}, distance=3)
+    state = torch.tensor([[5, 7], [7, 5], [0, 9]]).to(dtype)
+    action = rule(TensorDict({"observation": state}, [3]))[:, -1]
+    assert action.tolist() == [[1.0, 1.0], [1.0, 1.0], [1.0, 0.0]]

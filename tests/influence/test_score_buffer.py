@@ -30,6 +30,7 @@ from tests.influence.scoring import (
     definition,
     episodes,
     filled,
+    ready,
     scores,
     square,
 )
@@ -166,7 +167,7 @@ def test_graph_estimator_that_reads_the_action():
 
 
 def test_learned_estimator():
-    model = GaussianWorldModel(LAYOUT, 2, (16, 16))
+    model = ready(GaussianWorldModel(LAYOUT, 2, (16, 16)))
     rows = episodes([6, 5])
     rb = filled(rows)
     estimator = CAI(model, num_actions=8)
@@ -312,7 +313,10 @@ CHILD = """
 
     torch.manual_seed(0)
     layout = EntityLayout({"arm": [0], "cup": [1], "pot": [2]})
-    estimator = Slow(GaussianWorldModel(layout, 2, (32, 32)), num_actions=8)
+    model = GaussianWorldModel(layout, 2, (32, 32))
+    model.fit_statistics(torch.tensor([[-1.0], [1.0]]).expand(2, 3))
+    model.set_action_bounds(-1.0, 1.0)
+    estimator = Slow(model, num_actions=8)
     for name in sys.argv[3:]:
         Slow.count = 0
         data = TensorDict.load_memmap(root / name)

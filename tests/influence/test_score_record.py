@@ -21,6 +21,7 @@ from tests.influence.scoring import (
     definition,
     episodes,
     filled,
+    ready,
     scores,
     square,
 )
@@ -104,7 +105,7 @@ def test_scores_with_other_settings_are_never_mixed(kind, change, named, tmp_pat
 
 def test_modes_of_cai_are_never_mixed():
     layout = EntityLayout({"arm": [0], "cup": [1, 2]})
-    model = GaussianWorldModel(layout, 2, (8,))
+    model = ready(GaussianWorldModel(layout, 2, (8,)))
     rb = filled(episodes([20, 20]))
     fast = {"mode": "fast", "threshold": 1e-4}
     score_buffer(rb, CAI(model, **fast), progress=False)

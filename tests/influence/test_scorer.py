@@ -15,6 +15,7 @@ from tests.influence.scoring import (
     Read,
     episodes,
     filled,
+    ready,
     scores,
 )
 from torchrl_caiac import EntityLayout
@@ -96,7 +97,7 @@ def test_prepare_gets_states_of_the_whole_buffer():
 def test_interrupted_fast_scores_resume_to_the_same_bytes():
     layout = EntityLayout({"arm": [0], "cup": [1, 2]})
     torch.manual_seed(0)
-    model = GaussianWorldModel(layout, 2, (8,))
+    model = ready(GaussianWorldModel(layout, 2, (8,)))
     rows = episodes([60, 60, 60])
 
     def estimator():
@@ -125,13 +126,14 @@ def test_rows_that_are_not_finite_are_named_in_the_fast_mode():
     layout = EntityLayout({"arm": [0], "cup": [1, 2]})
     rows = episodes([20, 20])
     rows["observation"][33, 1] = torch.nan
-    fast = CAI(GaussianWorldModel(layout, 2, (8,)), mode="fast", threshold=1e-4)
+    model = ready(GaussianWorldModel(layout, 2, (8,)))
+    fast = CAI(model, mode="fast", threshold=1e-4)
     with pytest.raises(ValueError, match=r"state of the rows \[33\]"):
         score_buffer(filled(rows), fast, progress=False)
 
 
 def model_cai(**kwargs):
-    return CAI(GaussianWorldModel(LAYOUT, 2, (16, 16)), 32, **kwargs)
+    return CAI(ready(GaussianWorldModel(LAYOUT, 2, (16, 16))), 32, **kwargs)
 
 
 def attention(**kwargs):

@@ -112,3 +112,48 @@ def test_device_and_dtype_are_those_of_the_parameters() -> None:
     model = LinearModel(LAYOUT, 2)
     assert model.dtype == torch.float32 and model.device == torch.device("cpu")
     assert model.double().dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.uint8, torch.int8, torch.uint16, torch.int64, torch.bool]
+)
+def test_integers_and_flags_are_fitted_as_the_numbers_that_they_are(
+    dtype: torch.dtype,
+) -> None:
+    """A column that falls by one has a change of -1, not of 255."""
+    generator = torch.Generator().manual_seed(0)
+    high = 2 if dtype == torch.bool else 100
+    before = torch.randint(high, (200, 3), generator=generator).to(dtype)
+    step = torch.randint(2, (200, 3), generator=generator)
+    after = (before.long() - step).clamp_min(0).to(dtype)
+    data = transitions(200)
+    whole = data.replace({"observation": before, "next": {"observation": after}})
+    exact = data.replace(
+        {"observation": before.double(), "next": {"observation": after.double()}}
+    )
+    for target in ("change", "absolute"):
+        models = []
+        for td in (whole, exact):
+            torch.manual_seed(0)
+            model = GaussianWorldModel(LAYOUT, 2, (8,), target=target)
+            model.fit_statistics(td)
+            models.append(model)
+            fitted = GaussianWorldModel.from_config(model.config)
+            fitted.load_state_dict(model.state_dict())
+            for memory in (2**30, 0):  # in one block, and batch by batch
+                fit_world_model(
+                    fitted, td, steps=2, batch_size=8, max_memory=memory, progress=False
+                )
+                models.append(fitted)
+        own, reference = models[:3], models[3:]
+        for one, other in zip(own, reference, strict=True):
+            assert torch.equal(one.target_scale, other.target_scale)
+            assert torch.equal(one.target_loc, other.target_loc)
+            same = zip(one.parameters(), other.parameters(), strict=True)
+            assert all(torch.equal(a, b) for a, b in same)
+        torch.testing.assert_close(own[0].targets(whole), reference[0].targets(exact))
+        torch.testing.assert_close(
+            own[0].predict_next(whole),
+            reference[0].predict_next(exact),
+            check_dtype=False,
+        )

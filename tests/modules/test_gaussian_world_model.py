@@ -319,6 +319,7 @@ def test_state_dict_carries_statistics_and_compares_arguments(tmp_path: Path) ->
 
     layout = EntityLayout({"arm": [0, 1, 4], "cup": [6, 5], "lamp": [2]})
     other = GaussianWorldModel(layout, 2, (8,), variance_floor=0.01)
+    other.set_action_bounds(0.0, 1.0)
     before = copy.deepcopy(other.state_dict())
     with pytest.raises(ValueError, match=r"(?s)another layout.*lid.*lamp"):
         other.load_state_dict(state)

@@ -207,3 +207,21 @@ def test_statistics_refuse_what_is_not_finite():
     with pytest.raises(ValueError, match=r"no .* rows"):
         features.fit_statistics(rows(0))
     assert (features.norm.mean == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int8, torch.int64, torch.bool])
+def test_integers_and_flags_are_the_numbers_that_they_are(dtype) -> None:
+    generator = torch.Generator().manual_seed(0)
+    data = rows(20)
+    for key, value in data.items():
+        data[key] = torch.randint(2, value.shape, generator=generator).to(dtype)
+    exact = data.to(torch.float64)
+    for features in (GoalFeatures(push(), reference="gripper"), GoalFeatures(push())):
+        found = [features(td)["features"] for td in (data, exact)]
+        assert found[0].min() == -1.0
+        torch.testing.assert_close(*found)
+        fitted = [
+            GoalFeatures(push(), reference=features.reference).fit_statistics(td)
+            for td in (data, exact)
+        ]
+        torch.testing.assert_close(*(f(data)["features"] for f in fitted))

@@ -178,3 +178,20 @@ def test_wrong_sizes_are_named() -> None:
         ValueError, match=r"\[\*B, 3\] features, got the shape \[5, 2\]"
     ):
         RunningNorm(3)(torch.zeros(5, 2))
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.uint8, torch.int8, torch.uint16, torch.int64, torch.bool]
+)
+@pytest.mark.parametrize("frozen", [False, True])
+def test_integers_and_flags_are_normalised_as_the_numbers_that_they_are(dtype, frozen):
+    x = torch.tensor([[0, 1], [1, 0], [1, 100], [0, 100]]).to(dtype)
+    norms = []
+    for value in (x, x.double()):
+        norm = RunningNorm(2, frozen=frozen)
+        norm.replace(gather_statistics(value, "x", bound=None))
+        norms.append(norm(value))
+    torch.testing.assert_close(norms[0], norms[1])
+    with pytest.raises(ValueError, match=r"'x' has values up to 128"):
+        low = torch.tensor([[-128]], dtype=torch.int8)  # whose int8 abs() is -128
+        gather_statistics(low, "x", bound=1.0)

@@ -219,6 +219,7 @@ def test_config_copies_and_pickles(layout: EntityLayout) -> None:
         variance_floor={"arm": 0.1, "cup": 0.2, "lid": 0.3},
         target="absolute",
     )
+    model.set_action_bounds(-1.0, 2.0)
     twin = TransformerWorldModel.from_config(model.config)
     twin.load_state_dict(model.state_dict())
     for other in (twin, copy.deepcopy(model), pickle.loads(pickle.dumps(model))):

@@ -662,12 +662,39 @@ def test_action_spec_bounds_the_smoothed_action():
     loss.qvalue_network.register_forward_pre_hook(
         lambda module, args: seen.append(args[0]["action"].detach().clone())
     )
-    loss.value_loss(make_batch(50))
+    batch = make_batch(50)
+    batch["action"] *= 0.1
+    loss.value_loss(batch)
     of_targets, of_critics = seen
     assert of_targets.shape == of_critics.shape == (2, 50, A)
     assert of_targets.abs().max() <= 0.1 + 1e-6
     assert (of_targets.abs() > 0.09).any()
-    assert of_critics.abs().max() > 0.5
+    assert torch.equal(of_critics, batch["action"].expand(2, 50, A))
+
+
+@pytest.mark.parametrize("which", ["value_loss", "actor_loss"])
+def test_actions_outside_of_their_bounds_are_refused(which):
+    batch = make_batch(50)
+    bounds = batch["action"].clone().abs().max().item()
+    batch["action"][7, 1] = -1.01
+    for loss in (make_loss(), make_loss(bounds=(-1.0, 1.0))):
+        message = (
+            r"'action' is -1\.01 in column 1 of row 7, expected \[-1, 1\] \(1 such"
+        )
+        for _ in range(2):
+            with pytest.raises(ValueError, match=message):
+                getattr(loss, which)(batch)
+    getattr(make_loss(bounds=(-1.011, 1.0)), which)(batch)
+    getattr(make_loss(bounds=(-1.009, 1.0)), which)(batch)  # rounding
+    batch["action"][7, 1] = float("nan")
+    with pytest.raises(ValueError, match="'action' is nan in column 1 of row 7"):
+        getattr(make_loss(), which)(batch)
+    degrees = make_batch(50)
+    degrees["action"] *= 90 / bounds
+    spec = Bounded(-90.0, 90.0, shape=(A,))
+    getattr(make_loss(action_spec=spec), which)(degrees)
+    with pytest.raises(ValueError, match=r"\d+ such rows of 50.: give bounds or"):
+        getattr(make_loss(), which)(degrees)
 
 
 def test_input_is_not_changed():

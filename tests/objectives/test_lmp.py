@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch.distributions import Independent, Normal, kl_divergence
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_caiac.modules.lmp import LMPModel, gaussian_plan
 from torchrl_caiac.objectives.lmp import LMPLoss, balanced_kl, gaussian_kl
@@ -379,3 +380,26 @@ def test_losses_of_a_gpu_are_those_of_the_cpu():
         assert all(value.device.type == device for value in losses.values())
         found.append(losses.detach().cpu())
     torch.testing.assert_close(found[1].to_dict(), found[0].to_dict())
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int8, torch.int64, torch.bool])
+@pytest.mark.parametrize("decoder", ["open_loop", "closed_loop"])
+def test_integers_and_flags_are_the_numbers_that_they_are(dtype, decoder):
+    whole = make_batch(8)
+    for key in ("observation", "desired_goal"):
+        whole[key] = (whole[key] > 0).to(dtype)
+    whole["mask"] = torch.ones(8, K, dtype=torch.bool)
+    whole["mask"][3, 2:] = False
+    exact = whole.clone()
+    for key in ("observation", "desired_goal"):
+        exact[key] = exact[key].double()
+    losses = []
+    for td in (whole, exact):
+        model = make_model(decoder=decoder).fit_statistics(td)
+        losses.append(make_loss(model)(td))
+        for name in ("observation_norm", "goal_norm"):
+            losses[-1][name] = getattr(model, name).mean
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            losses[-1]["plan"] = model(td[:, 0].clone())["plan"]
+    for key, value in losses[0].items():
+        torch.testing.assert_close(value, losses[1][key])

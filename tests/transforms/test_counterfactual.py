@@ -113,10 +113,12 @@ def test_keys_that_are_read_and_written() -> None:
     assert made.in_keys == [*state, "age"] and made.out_keys == [*state, *flags]
     goals = ["achieved_goal", ("next", "achieved_goal")]
     goals += ["desired_goal", ("next", "desired_goal")]
-    made = CAIACTransform(goal, reward_fn=min, keys=TransformKeys(reward="r"))
+    made = CAIACTransform(
+        goal, reward_fn=lambda a, d: a, keys=TransformKeys(reward="r")
+    )
     assert made.in_keys == [*state, *goals, ("caiac", "score"), "r"]
     assert made.out_keys == [*state, *goals, "r", *flags]
-    relabel = HindsightGoal(goal, min)
+    relabel = HindsightGoal(goal, lambda a, d: a)
     assert relabel.in_keys[:2] == [("next", "observation"), "desired_goal"]
     assert relabel.out_keys[-1] == ("hindsight", "relabeled")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from torchrl_caiac._files import UnreadableFileError
+from torchrl_caiac.data.action_bounds import action_bounds
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
 from torchrl_caiac.data.load_minari import load_minari
 from torchrl_caiac.data.load_transitions import load_transitions
@@ -9,6 +11,8 @@ from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
 
 __all__ = [
+    "UnreadableFileError",
+    "action_bounds",
     "collect_episodes",
     "load_episode",
     "load_minari",

@@ -7,7 +7,6 @@ import hashlib
 import json
 import logging
 import os
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, Union
@@ -15,8 +14,15 @@ from typing import Any, Protocol, Union
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_caiac._files import whole_file, write_json
+from torchrl_caiac._files import (
+    UnreadableFileError,
+    read_json,
+    remove_leftovers_in,
+    whole_file,
+    write_json,
+)
 from torchrl_caiac._processes import available_processors, run_in_processes
+from torchrl_caiac.data.npz import read_npz
 from torchrl_caiac.data.trees import copy_tree, stack_trees
 
 __all__ = [
@@ -35,6 +41,8 @@ EpisodeArrays = Mapping[str, Union[NDArray[Any], "EpisodeArrays"]]
 _MANIFEST = "collection.json"
 _META = "meta"
 _SEPARATOR = "/"
+_WHAT = "episode of this collection"
+_AGAIN = "delete it and collect again"
 
 
 class EpisodeSource(Protocol):
@@ -142,6 +150,7 @@ def collect_episodes(
         raise ValueError(f"workers is {workers}, expected at least 1")
     root = Path(folder)
     _claim_folder(root, seed, specs)
+    remove_leftovers_in(root)
     files = [root / f"episode_{index:06d}.npz" for index in range(len(specs))]
     failures = {
         index: _read_meta(file)["attempts"] - 1
@@ -198,7 +207,7 @@ def load_episode(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is truncated or is not an episode.
+        UnreadableFileError: the file is truncated or is not an episode.
 
     Examples:
         >>> import tempfile
@@ -213,20 +222,25 @@ def load_episode(
         {'infos': {'goal': array([0., 0.])}}
     """
     path = Path(file)
-    meta = _read_meta(path)
+    stored = read_npz(path, _WHAT, _AGAIN)
+    meta = _episode_meta(path, stored.pop(_META, None))
     arrays: dict[str, Any] = {}
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            for name in stored.files:
-                if name == _META:
-                    continue
-                *parents, leaf = name.split(_SEPARATOR)
-                place = arrays
-                for parent in parents:
-                    place = place.setdefault(parent, {})
-                place[leaf] = stored[name]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise _unreadable(path, error) from error
+    for name, array in stored.items():
+        *parents, leaf = name.split(_SEPARATOR)
+        place = arrays
+        for parent in parents:
+            place = place.setdefault(parent, {})
+            if not isinstance(place, dict):
+                raise UnreadableFileError(
+                    f"{path} is not a readable {_WHAT}, it has arrays in and at "
+                    f"{parent!r}: {_AGAIN}"
+                )
+        if leaf in place:
+            raise UnreadableFileError(
+                f"{path} is not a readable {_WHAT}, it has two entries {name!r}: "
+                f"{_AGAIN}"
+            )
+        place[leaf] = array
     return arrays, meta
 
 
@@ -321,7 +335,7 @@ def _collect_episode(
         flat = _flat(arrays)
         meta = {"spec": spec, "seed": seed, "attempts": attempt + 1}
         flat[_META] = np.array(json.dumps(meta))
-        with whole_file(file) as partial:
+        with whole_file(file, tidy=False) as partial:
             np.savez(partial, **flat)  # type: ignore[arg-type]
         return attempt + 1
     raise RuntimeError(
@@ -340,10 +354,7 @@ def _claim_folder(root: Path, seed: int, specs: Sequence[Mapping[str, Any]]) -> 
     }
     path = root / _MANIFEST
     if path.exists():
-        try:
-            found = json.loads(path.read_text())
-        except ValueError as error:
-            raise _unreadable(path, error) from error
+        found = read_json(path, "record of a collection", _AGAIN)
         if found != manifest:
             raise ValueError(
                 f"{root} has another collection: found {found}, expected {manifest}; "
@@ -380,18 +391,27 @@ def _flat(arrays: EpisodeArrays, prefix: str = "") -> dict[str, NDArray[Any]]:
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
+    stored = read_npz(path, _WHAT, _AGAIN, names=[_META])
+    return _episode_meta(path, stored.get(_META))
+
+
+def _episode_meta(path: Path, stored: NDArray[Any] | None) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            meta = json.loads(str(stored[_META]))
-        return {key: meta[key] for key in ("spec", "seed", "attempts")}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> ValueError:
-    return ValueError(
-        f"{path} is truncated or was not written by this collection "
-        f"({type(error).__name__}: {error}): delete it and collect again"
-    )
+        if stored is None or stored.ndim or stored.dtype.kind != "U":
+            raise ValueError(f"{_META!r} is missing or not a text")
+        meta = json.loads(str(stored))
+        if not isinstance(meta, dict):
+            raise ValueError(f"{_META!r} is {meta!r}")
+        kept: dict[str, Any] = {
+            key: meta.get(key) for key in ("spec", "seed", "attempts")
+        }
+        if not isinstance(kept["spec"], dict):
+            raise ValueError(f"'spec' is {kept['spec']!r}")
+        for key, least in (("seed", 0), ("attempts", 1)):
+            if type(kept[key]) is not int or kept[key] < least:
+                raise ValueError(f"{key!r} is {kept[key]!r}")
+    except (ValueError, RecursionError) as error:
+        raise UnreadableFileError(
+            f"{path} is not a readable {_WHAT} ({error}): {_AGAIN}"
+        ) from error
+    return kept

@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from tqdm.auto import tqdm
 
-from torchrl_caiac._files import whole_folder
+from torchrl_caiac._files import UnreadableFileError, reserve, whole_folder
+from torchrl_caiac._keys import as_key
+from torchrl_caiac._keys import path as path_of
+from torchrl_caiac.data.action_bounds import write_action_bounds
+from torchrl_caiac.data.digests import (
+    data_source,
+    file_digest,
+    has_digests,
+    write_digests,
+)
 from torchrl_caiac.data.load_transitions import load_transitions
-from torchrl_caiac.data.write_transitions import check_free
+from torchrl_caiac.data.minari_checks import episode_lengths
+from torchrl_caiac.data.minari_files import open_minari
+from torchrl_caiac.data.write_transitions import check_entries, check_free
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.dataset.episode_data import EpisodeData
 
 __all__ = ["load_minari"]
+
+_logger = logging.getLogger("torchrl_caiac.data.load_minari")
 
 # The names that entries of an observation must not have.
 _TAKEN = {"action", "done", "episode", "info", "next"}
@@ -33,6 +49,7 @@ def load_minari(
     download: bool = False,
     columns: Sequence[int] | None = None,
     infos: Sequence[str] = (),
+    exclude: Sequence[NestedKey] = (),
     overwrite: bool = False,
     progress: bool = True,
 ) -> TensorDict:
@@ -48,6 +65,10 @@ def load_minari(
     environments, its entries become entries of the root. Any other dict becomes a
     nested ``"observation"``. Floating-point numbers become float32.
 
+    The folder also has the bounds of the action space (see
+    :func:`~torchrl_caiac.data.action_bounds`) where they are finite, and the digests of
+    its leaves and of the dataset's files.
+
     Args:
         dataset (str or MinariDataset): the dataset or its id.
         path (str or Path): the folder to write. It is written atomically.
@@ -59,6 +80,10 @@ def load_minari(
             ``None``: all.
         infos (sequence of str): the entries of the episodes' infos to keep, unchanged,
             under ``"info"``. Row ``t`` has the info of its state. Defaults to ``()``.
+        exclude (sequence of NestedKey): entries of the observations and of ``infos`` to
+            leave out, such as texts, by their keys in the transitions, for example
+            ``"mission"``, ``("observation", "camera")`` or ``("info", "name")``.
+            Defaults to ``()``.
         overwrite (bool): whether to replace ``path`` if it exists. Defaults to
             ``False``.
         progress (bool): whether to show a progress bar over the episodes. Defaults to
@@ -70,9 +95,11 @@ def load_minari(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         FileNotFoundError: the dataset is not on this machine.
-        KeyError: an episode lacks one of ``infos``.
-        ValueError: the dataset is empty; an episode is empty, inconsistent, or has NaN
-            or infinite values; ``columns`` do not fit the observation.
+        KeyError: an episode lacks one of ``infos`` or ``exclude``.
+        OSError: the disk is full.
+        UnreadableFileError: the dataset is damaged, or opening it would run code.
+        ValueError: the dataset is empty; an episode is empty, inconsistent, or has NaN,
+            infinite values, texts or objects; ``columns`` do not fit the observation.
 
     Examples:
         >>> import os, tempfile
@@ -104,20 +131,57 @@ def load_minari(
         torch.Size([10, 3])
         >>> folder.cleanup()
     """
-    import minari
-
     check_free(path, overwrite)
     if isinstance(dataset, str):
-        dataset = minari.load_dataset(dataset, download=download)
-    lengths = [
-        int(meta["total_steps"])
-        for meta in dataset.storage.get_episode_metadata(dataset.episode_indices)
-    ]
+        dataset = open_minari(dataset, download=download)
+    lengths = episode_lengths(dataset)
     if not sum(lengths):
         raise ValueError(f"the dataset {dataset.id} has no steps: give another one")
+    import gymnasium
+
+    left_out = {path_of(as_key(key)) for key in exclude}
+    source = _source(dataset)
+    if has_digests(path) and data_source(path) != source:
+        _logger.warning(
+            "%s was written from other data than those of %s now: it is replaced",
+            path,
+            dataset.id,
+        )
     with whole_folder(path) as folder:
-        _fill(dataset, lengths, folder, columns, infos, progress)
+        _fill(dataset, lengths, folder, columns, infos, left_out, progress)
+        write_digests(folder, source=source)
+        space = dataset.action_space
+        is_box = isinstance(space, gymnasium.spaces.Box)
+        if is_box and space.shape and space.is_bounded():
+            write_action_bounds(folder, space.low, space.high)
     return load_transitions(path)
+
+
+def _source(dataset: MinariDataset) -> dict[str, Any]:
+    """Returns the digests of the dataset's files, and the episodes that are taken."""
+    folder = Path(dataset.storage.data_path)
+    files = {
+        file.relative_to(folder).as_posix(): file_digest(file)
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.name != "metadata.json"  # it may get new remarks
+    }
+    episodes = [int(index) for index in dataset.episode_indices]
+    return {"dataset": dataset.id, "sha256": files, "episodes": episodes}
+
+
+def _episodes(dataset: MinariDataset) -> Iterator[EpisodeData]:
+    """Yields all episodes; names the file and the episode that cannot be read."""
+    episodes = dataset.iterate_episodes()
+    for index in dataset.episode_indices:
+        try:
+            episode = next(episodes)
+        except Exception as error:  # h5py, Pillow and Minari raise many kinds
+            raise UnreadableFileError(
+                f"Minari cannot read episode {index} of {dataset.id} in "
+                f"{dataset.storage.data_path} ({type(error).__name__}: {error}): "
+                "download or collect the dataset again"
+            ) from error
+        yield episode
 
 
 def _fill(
@@ -126,23 +190,25 @@ def _fill(
     folder: Path,
     columns: Sequence[int] | None,
     infos: Sequence[str],
+    left_out: set[tuple[str, ...]],
     progress: bool,
 ) -> None:
     rows: TensorDict | None = None
     first = 0
-    episodes: Iterator[EpisodeData] = dataset.iterate_episodes()
     bar = tqdm(
-        zip(episodes, lengths, strict=True),
+        zip(_episodes(dataset), lengths, strict=True),
         total=len(lengths),
         desc=f"loading {dataset.id}",
         unit="episode",
         disable=not progress,
     )
     for number, (episode, length) in enumerate(bar):
-        part = _transitions(episode, length, columns, infos, dataset.id)
+        part = _transitions(episode, length, columns, infos, left_out, dataset.id)
         part["episode"] = torch.full((length,), number)
         if rows is None:
+            check_entries(part, dataset.id)
             rows = part[:1].expand(sum(lengths)).memmap_like(folder)
+            reserve(folder)
         # A memmap silently broadcasts, casts or ignores entries that do not fit.
         differ = {leaf[0] for leaf in _structure(part) ^ _structure(rows)}
         if differ:
@@ -166,6 +232,7 @@ def _transitions(
     length: int,
     columns: Sequence[int] | None,
     infos: Sequence[str],
+    left_out: set[tuple[str, ...]],
     dataset_id: str,
 ) -> TensorDict:
     where = f"episode {episode.id} of {dataset_id}"
@@ -195,6 +262,15 @@ def _transitions(
                 f"{sorted(episode.infos or {})}: correct infos="
             )
         kept[name] = episode.infos[name]
+    known = set(_paths({**states, "info": kept}))
+    unknown = sorted(left_out - known)
+    if unknown:
+        raise KeyError(
+            f"{where} has no {unknown}, its observations and infos have "
+            f"{sorted(known)}: correct exclude="
+        )
+    states = _without(states, left_out)
+    kept = _without(kept, {key[1:] for key in left_out if key[0] == "info"})
     td = TensorDict(
         {
             **_tensors(states, length + 1, where, slice(0, length)),
@@ -210,7 +286,9 @@ def _transitions(
         [length],
     )
     if kept:
-        td["info"] = _tensors(kept, length + 1, where, slice(0, length), cast=False)
+        td["info"] = _tensors(
+            kept, length + 1, where, slice(0, length), cast=False, above=("info",)
+        )
     for key in ("terminated", "truncated"):
         td["next", key] = td["next", key].bool()
     td["next", "truncated"][-1] |= ~td["next", "terminated"][-1]
@@ -233,6 +311,27 @@ def _columns(states: Mapping[str, Any], columns: Sequence[int], where: str) -> A
     return observation[:, list(columns)]
 
 
+def _paths(
+    tree: Mapping[str, Any], above: tuple[str, ...] = ()
+) -> Iterator[tuple[str, ...]]:
+    for key, value in tree.items():
+        yield (*above, key)
+        if isinstance(value, Mapping):
+            yield from _paths(value, (*above, key))
+
+
+def _without(
+    tree: Mapping[str, Any], keys: set[tuple[str, ...]], above: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    return {
+        key: _without(value, keys, (*above, key))
+        if isinstance(value, Mapping)
+        else value
+        for key, value in tree.items()
+        if (*above, key) not in keys
+    }
+
+
 def _tensors(
     tree: Mapping[str, Any],
     length: int,
@@ -240,22 +339,26 @@ def _tensors(
     part: slice = slice(None),
     *,
     cast: bool = True,
+    above: tuple[str, ...] = (),
 ) -> dict[str, Any]:
     result: dict[str, Any] = {}
-    for key, value in tree.items():
+    for name, value in tree.items():
+        key = (*above, name) if above else name
         if isinstance(value, Mapping):
-            result[key] = _tensors(value, length, where, part, cast=cast)
+            inner = (*above, name)
+            result[name] = _tensors(value, length, where, part, cast=cast, above=inner)
             continue
         if isinstance(value, tuple):
             raise ValueError(
                 f"{key!r} in {where} is a tuple of spaces, which has no keys: "
-                "convert it to a dict"
+                f"convert it to a dict, or pass exclude=[{key!r}]"
             )
-        array = np.asarray(value)
-        if len(array) != length:
+        array = _numbers(value, key, where)
+        entries = len(array) if array.ndim else "no"
+        if entries != length:
             raise ValueError(
-                f"{key!r} in {where} has {len(array)} entries, expected {length}: "
-                "remove the episode"
+                f"{key!r} in {where} has {entries} entries, expected {length}: remove "
+                "the episode"
             )
         if np.issubdtype(array.dtype, np.floating):
             with np.errstate(over="ignore"):
@@ -266,5 +369,19 @@ def _tensors(
                     "remove the episode with MinariDataset.filter_episodes"
                 )
         # Copied, because Minari may return read-only arrays.
-        result[key] = torch.from_numpy(np.array(array[part]))
+        result[name] = torch.from_numpy(np.array(array[part]))
     return result
+
+
+def _numbers(value: Any, key: NestedKey, where: str) -> NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        array = np.empty(0, object)
+    if array.dtype.kind not in "biuf" or array.dtype == np.longdouble:
+        kind = {"O": "Python objects", "S": "bytes", "U": "text"}.get(array.dtype.kind)
+        raise ValueError(
+            f"{key!r} in {where} has {kind or array.dtype}, expected numbers: pass "
+            f"exclude=[{key!r}], or convert it in the dataset"
+        )
+    return array

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +11,30 @@ import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._files import UnreadableFileError, read_json, recover_meta
 from torchrl_caiac._keys import leaf_names
 from torchrl_caiac._torchrl import file_name, mark_memmap
+from torchrl_caiac.data.digests import verify_digests
 
 __all__ = ["load_transitions"]
 
 _KEYS: tuple[NestedKey, ...] = ("action", "episode", ("next", "done"))
+# What meta.json has besides the entries.
+_COMMON = {"shape", "device", "_type"}
 
 _AGAIN = "delete the folder and create the data again"
 
 
 def load_transitions(
-    path: str | Path, *, keys: Iterable[NestedKey] = _KEYS
+    path: str | Path, *, keys: Iterable[NestedKey] = _KEYS, verify: bool = False
 ) -> TensorDict:
     """Opens a memory-mapped tensordict of flat transitions.
 
     ``TensorDict.load_memmap`` fills the missing part of a truncated file with zeros, in
-    the data and on disk. This function checks the size of every file first. The
-    returned tensordict is flagged as memory-mapped, so that leaves can be added to it.
+    the data and on disk. This function checks the size of every file first, and reads
+    nothing but tensors. The returned tensordict is flagged as memory-mapped, so that
+    leaves can be added to it. If a process was killed while it added one, the folder is
+    restored to what it was before.
 
     Args:
         path (str or Path): the folder, as written by
@@ -39,16 +44,21 @@ def load_transitions(
     Keyword Args:
         keys (iterable of NestedKey): the keys that the data must have. Defaults to
             ``"action"``, ``"episode"`` and ``("next", "done")``.
+        verify (bool): whether to compare the content of all leaves with the digests
+            that were written with them, see
+            :func:`~torchrl_caiac.data.digests.verify_digests`. This reads all files.
+            Defaults to ``False``: only sizes are checked.
 
     Returns:
         TensorDict: the transitions, ``[T]``, memory-mapped and locked. Writing to a
-        leaf writes to disk.
+        leaf writes to disk, unless its file is read-only.
 
     Raises:
-        FileNotFoundError: the folder does not exist.
-        ValueError: the folder is not a memory-mapped tensordict, is truncated, has
-            something other than tensors (it could be a pickle, and is not read), has no
-            rows or several batch dimensions, or lacks a key.
+        FileNotFoundError: the folder does not exist, or has no digests to verify.
+        UnreadableFileError: the folder is not a memory-mapped tensordict, is truncated,
+            has something other than tensors (it could be a pickle, and is not read), or
+            other content than its digests.
+        ValueError: it has no rows or several batch dimensions, or lacks a key.
 
     Examples:
         >>> import tempfile
@@ -67,13 +77,34 @@ def load_transitions(
             f"the folder {path} does not exist: create the data first, for example "
             "with load_minari"
         )
-    shape = _check_folder(path, path)
+    recover_meta(path)
+    leaves: set[tuple[str, ...]] = set()
+    try:
+        shape = _check_folder(path, path, [], leaves)
+    except RecursionError:
+        raise UnreadableFileError(f"{path} is nested too deeply: {_AGAIN}") from None
     if len(shape) != 1 or not shape[0]:
         raise ValueError(
             f"{path} has batch size {shape}, expected [T] with at least one row: store "
             "flat transitions"
         )
-    data = TensorDict.load_memmap(path, allow_pickle=False)
+    if verify:
+        verify_digests(path)
+    try:
+        data = TensorDict.load_memmap(path, allow_pickle=False)
+    except (RuntimeError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise UnreadableFileError(
+            f"{path} could not be opened by tensordict ({error}): {_AGAIN}"
+        ) from error
+    # tensordict leaves out what it does not understand.
+    lost = leaves - {
+        key if isinstance(key, tuple) else (key,)
+        for key in data.keys(include_nested=True, leaves_only=True)
+    }
+    if lost:
+        raise UnreadableFileError(
+            f"tensordict did not open {sorted(lost)} of {path}: {_AGAIN}"
+        )
     missing = [key for key in keys if data.get(key, None) is None]
     if missing:
         raise ValueError(
@@ -84,40 +115,68 @@ def load_transitions(
     return data.lock_()
 
 
-def _check_folder(folder: Path, root: Path) -> list[int]:
-    """Checks that a folder contains only complete tensors; returns its batch size."""
+def _check_folder(
+    folder: Path, root: Path, batch: list[int], leaves: set[tuple[str, ...]]
+) -> list[int]:
+    """Checks that a folder has only complete tensors, and adds their keys to a set.
+
+    Args:
+        folder (Path): the folder.
+        root (Path): the outermost one.
+        batch (list of int): the batch size of the tensordict around it.
+        leaves (set): what is added to.
+
+    Returns:
+        list of int: its own batch size.
+    """
     meta = folder / "meta.json"
     if not meta.exists():
-        raise ValueError(
+        raise UnreadableFileError(
             f"{root} is not a memory-mapped tensordict, {meta} is missing: give "
             f"another folder, or {_AGAIN}"
         )
+    content = read_json(meta, "description of a tensordict", _AGAIN)
     try:
-        content = json.loads(meta.read_text(encoding="utf-8"))
-        kind, shape = content["_type"], _shape(content["shape"])
+        kind, device = content["_type"], content["device"]
+        shape = _shape(content["shape"])
+        _check_batch(shape, batch)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{meta} is truncated or not from tensordict ({error}): {_AGAIN}"
+        raise UnreadableFileError(
+            f"{meta} is truncated or not from tensordict ({error!r}): {_AGAIN}"
         ) from error
-    if kind != str(TensorDict):
-        raise ValueError(
-            f"{meta} describes a {kind}, expected a TensorDict: store plain tensordicts"
+    if kind != str(TensorDict) or device not in ("cpu", "None"):
+        raise UnreadableFileError(
+            f"{meta} describes a {kind} on device {device}, expected a TensorDict in "
+            "memory: store plain tensordicts"
         )
-    for key, entry in content.items():
-        if not isinstance(entry, dict):
-            continue
+    for key, entry in _entries(content, meta):
         name = file_name(key)
         if entry.get("type") == "TensorDict":
-            _check_folder(folder / name, root)
+            inner: set[tuple[str, ...]] = set()
+            _check_folder(folder / name, root, shape, inner)
+            leaves |= {(key, *leaf) for leaf in inner}
         elif entry.get("type") is not None:
             # Its content may be a pickle, which could execute anything.
-            raise ValueError(
+            raise UnreadableFileError(
                 f"{meta} has a {entry['type']} in {key!r}, expected only tensors: "
                 "leave it out with exclude() before the data are stored"
             )
         else:
             _check_leaf(folder / f"{name}.memmap", entry, shape, meta, key)
+            leaves.add((key,))
     return shape
+
+
+def _entries(
+    content: dict[str, Any], meta: Path
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    for key, entry in content.items():
+        if isinstance(entry, dict) and key not in _COMMON:
+            yield key, entry
+        elif key not in _COMMON:
+            raise UnreadableFileError(
+                f"{meta} has an unreadable description of {key!r} ({entry!r}): {_AGAIN}"
+            )
 
 
 def _check_leaf(
@@ -125,28 +184,35 @@ def _check_leaf(
 ) -> None:
     """Checks that the size of a leaf's file matches its dtype and shape."""
     try:
-        dtype = getattr(torch, str(entry["dtype"]).removeprefix("torch."))
+        dtype = getattr(torch, str(entry["dtype"]).removeprefix("torch."), None)
+        # Exactly as tensordict writes it: it leaves out what it cannot read.
+        if not isinstance(dtype, torch.dtype) or str(dtype) != entry["dtype"]:
+            raise ValueError(f"{entry['dtype']!r} is not a dtype")
+        if entry.get("is_nested"):
+            raise ValueError("it is not a dense tensor")
         shape = _shape(entry["shape"])
-        if not isinstance(dtype, torch.dtype) or entry.get("is_nested"):
-            raise ValueError(f"{entry} is not a dense tensor")
-        if shape[: len(batch)] != batch:
-            raise ValueError(
-                f"shape {shape} does not begin with the batch size {batch}"
-            )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(
-            f"{meta} has an unreadable description of {key!r} ({error}): {_AGAIN}"
+        _check_batch(shape, batch)
+    except (ValueError, KeyError, TypeError) as error:
+        raise UnreadableFileError(
+            f"{meta} has an unreadable description of {key!r} ({error!r}): {_AGAIN}"
         ) from error
     expected = dtype.itemsize * math.prod(shape)
     if not file.exists():
         if not expected:
             return  # tensordict writes no file for a tensor without elements
-        raise ValueError(f"{meta.parent} is incomplete, {file} is missing: {_AGAIN}")
-    if file.stat().st_size != expected:
-        raise ValueError(
-            f"{file} has {file.stat().st_size} bytes, expected {expected} ({dtype} "
-            f"{shape}): {_AGAIN}"
+        raise UnreadableFileError(
+            f"{meta.parent} is incomplete, {file} is missing: {_AGAIN}"
         )
+    size = file.stat().st_size if file.is_file() else -1
+    if size != expected:
+        raise UnreadableFileError(
+            f"{file} has {size} bytes, expected {expected} ({dtype} {shape}): {_AGAIN}"
+        )
+
+
+def _check_batch(shape: list[int], batch: list[int]) -> None:
+    if shape[: len(batch)] != batch:
+        raise ValueError(f"shape {shape} does not begin with the batch size {batch}")
 
 
 def _shape(value: Any) -> list[int]:

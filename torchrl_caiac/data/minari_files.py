@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchrl_caiac._files import whole_folder
+from torchrl_caiac._files import UnreadableFileError, whole_folder
+from torchrl_caiac.data.minari_checks import check_metadata
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -103,6 +104,7 @@ def open_minari(
 
     Raises:
         FileNotFoundError: the dataset does not exist.
+        UnreadableFileError: its metadata are damaged, or would run code.
 
     Examples:
         >>> import tempfile
@@ -124,7 +126,14 @@ def open_minari(
             f"no Minari dataset {dataset_id!r} in {data.parent}: collect it first, "
             "pass download=True, or give its folder with root= or MINARI_DATASETS_PATH"
         )
-    return minari.MinariDataset(data)
+    check_metadata(data)
+    try:
+        return minari.MinariDataset(data)
+    except Exception as error:  # gymnasium and Minari raise many kinds
+        raise UnreadableFileError(
+            f"Minari cannot open {data} ({type(error).__name__}: {error}): download or "
+            "collect the dataset again"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -231,12 +240,11 @@ def publish_dataset(
     from minari import MinariDataset
     from tqdm import tqdm
 
-    target.parent.mkdir(parents=True, exist_ok=True)
     env = make_env()
     try:
-        with tempfile.TemporaryDirectory(
-            dir=target.parent, prefix=".partial-"
-        ) as partial:
+        with whole_folder(target) as made:
+            partial = made.parent / "minari"
+            partial.mkdir()
             bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
             with _datasets_in(partial):
                 minari.create_dataset_from_buffers(
@@ -251,13 +259,12 @@ def publish_dataset(
                     description=description,
                     requirements=list(requirements),
                 )
-            built = Path(partial) / dataset_id
+            built = partial / dataset_id
             # Minari stores the description of a namespace in a separate file.
             for extra in built.parent.iterdir():
                 if extra.is_file() and not (target.parent / extra.name).exists():
                     os.replace(extra, target.parent / extra.name)
-            with whole_folder(target) as made:
-                os.replace(built, made)
+            os.replace(built, made)
     finally:
         env.close()
     return MinariDataset(target / "data")

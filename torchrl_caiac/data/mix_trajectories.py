@@ -10,14 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import whole_folder
+from torchrl_caiac._files import reserve, whole_folder
 from torchrl_caiac._keys import get_leaf
 from torchrl_caiac._keys import path as key_path
+from torchrl_caiac._torchrl import memmap_folder
+from torchrl_caiac.data.action_bounds import action_bounds, write_action_bounds
+from torchrl_caiac.data.digests import data_digest, has_digests, write_digests
 from torchrl_caiac.data.load_transitions import load_transitions
-from torchrl_caiac.data.write_transitions import check_free
+from torchrl_caiac.data.write_transitions import check_entries, check_free
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 
 __all__ = ["mix_trajectories"]
@@ -56,6 +59,9 @@ def mix_trajectories(
       int64 ``[T']``;
     - ``source_trajectory_key``: the trajectory id in that dataset.
 
+    A folder also has digests of the leaves, and the bounds of the action space where
+    all sources have the same.
+
     Args:
         sources (sequence of TensorDictBase): transitions ``[T]``, in memory or
             memory-mapped, with the same keys, dtypes and shapes after ``T``. For the
@@ -85,6 +91,7 @@ def mix_trajectories(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         KeyError: a source lacks ``trajectory_key``.
+        OSError: the disk is full.
         ValueError: the sources have different leaves or none; ``shares``, ``fraction``
             or ``trajectories`` are out of range or need more trajectories than the
             sources have.
@@ -130,8 +137,28 @@ def mix_trajectories(
         _fill(mixed, sources, rows, *keys)
         return mixed
     with whole_folder(path) as folder:
-        _fill(one.cpu().expand(total).memmap_like(folder), sources, rows, *keys)
+        stored = one.cpu().expand(total).memmap_like(folder)
+        reserve(folder)
+        _fill(stored, sources, rows, *keys)
+        _write_origin(folder, sources)
     return load_transitions(path, keys=keys)
+
+
+def _write_origin(folder: Path, sources: Sequence[TensorDictBase]) -> None:
+    """Writes digests of the leaves and the sources, and the bounds of the actions."""
+    found = [memmap_folder(source) for source in sources]
+    digests = [
+        data_digest(place) if place and has_digests(place) else None for place in found
+    ]
+    write_digests(folder, source={"mixed": digests})
+    bounds = [action_bounds(source) for source in sources]
+    known = [pair for pair in bounds if pair is not None]
+    if len(known) == len(bounds) and all(
+        torch.equal(torch.stack(pair), torch.stack(known[0])) for pair in known
+    ):
+        write_action_bounds(folder, *known[0])
+    elif known:
+        logger.warning("the sources have different action spaces: no bounds are stored")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -303,11 +330,8 @@ def _check_sources(sources: Sequence[TensorDictBase], new: Sequence[NestedKey]) 
 def _structure(
     rows: TensorDictBase, number: int
 ) -> dict[tuple[str, ...], tuple[torch.dtype, tuple[int, ...]]]:
-    structure = {}
-    for key, leaf in rows.items(True, True, is_leaf=is_leaf_nontensor):
-        if not isinstance(leaf, torch.Tensor):
-            raise ValueError(
-                f"{key!r} of source {number} is not a tensor: remove it with exclude()"
-            )
-        structure[key_path(key)] = (leaf.dtype, tuple(leaf.shape[1:]))
-    return structure
+    check_entries(rows, f"source {number}")
+    return {
+        key_path(key): (leaf.dtype, tuple(leaf.shape[1:]))
+        for key, leaf in rows.items(include_nested=True, leaves_only=True)
+    }

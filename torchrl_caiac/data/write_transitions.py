@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
-from tensordict import TensorDict, TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 
-from torchrl_caiac._files import whole_folder
+from torchrl_caiac._files import reserve, whole_folder
+from torchrl_caiac._keys import path as path_of
+from torchrl_caiac.data.action_bounds import write_action_bounds
+from torchrl_caiac.data.digests import write_digests
 from torchrl_caiac.data.load_transitions import load_transitions
 
-__all__ = ["check_free", "write_transitions"]
+__all__ = ["check_entries", "check_free", "write_transitions"]
+
+# Under these names, tensordict writes its own entries to meta.json.
+_RESERVED = {"_type", "device", "shape"}
 
 
 def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> None:
@@ -34,8 +42,42 @@ def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> 
         )
 
 
+def check_entries(data: TensorDictBase, what: str = "the data") -> None:
+    """Raises if entries cannot be stored as transitions.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        what (str): the data's name in the error message. Defaults to ``"the data"``.
+
+    Raises:
+        ValueError: an entry is not a tensor, or has a name that tensordict's files
+            reserve.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.write_transitions import check_entries
+        >>> check_entries(TensorDict({"action": torch.zeros(3, 2)}, [3]))
+    """
+    for key, leaf in data.items(True, True, is_leaf=is_leaf_nontensor):
+        if not isinstance(leaf, torch.Tensor):
+            raise ValueError(
+                f"{key!r} of {what} is a {type(leaf).__name__}, expected a tensor: "
+                "leave it out with exclude()"
+            )
+        if _RESERVED & set(path_of(key)):
+            raise ValueError(
+                f"{key!r} of {what} has one of the names {sorted(_RESERVED)}, which "
+                "tensordict's files reserve: rename it"
+            )
+
+
 def write_transitions(
-    data: TensorDictBase, path: str | os.PathLike[str], *, overwrite: bool = False
+    data: TensorDictBase,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    action_bounds: tuple[Any, Any] | None = None,
 ) -> TensorDict:
     """Writes transitions to a folder, atomically, and opens it.
 
@@ -46,12 +88,19 @@ def write_transitions(
     Keyword Args:
         overwrite (bool): whether to replace ``path`` if it exists. Defaults to
             ``False``.
+        action_bounds (tuple of torch.Tensor or sequence, optional): the lowest and the
+            highest action, ``[A]`` each, finite. They are stored beside the
+            transitions, see :func:`~torchrl_caiac.data.action_bounds`. Defaults to
+            ``None``: the bounds are unknown.
 
     Returns:
         TensorDict: the memory-mapped transitions, ``[T]``.
 
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        OSError: the disk is full.
+        ValueError: an entry is not a tensor or has a reserved name, or
+            ``action_bounds`` are not bounds of the actions.
 
     Examples:
         >>> import tempfile
@@ -71,6 +120,23 @@ def write_transitions(
         True
     """
     check_free(path, overwrite)
+    check_entries(data)
+    if action_bounds is not None:
+        _check_bounds(data, action_bounds)
     with whole_folder(path) as folder:
-        data.memmap(folder)
+        stored = data.memmap_like(folder)
+        reserve(folder)
+        stored.update_(data)
+        write_digests(folder)
+        if action_bounds is not None:
+            write_action_bounds(folder, *action_bounds)
     return load_transitions(Path(path))
+
+
+def _check_bounds(data: TensorDictBase, bounds: tuple[Any, Any]) -> None:
+    action, shape = data.get("action", None), list(torch.as_tensor(bounds[0]).shape)
+    if action is not None and list(action.shape[data.batch_dims :]) != shape:
+        raise ValueError(
+            f"action_bounds have shape {shape}, but 'action' has shape "
+            f"{list(action.shape)}: give one bound for each number of an action"
+        )

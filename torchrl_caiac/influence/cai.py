@@ -20,6 +20,11 @@ from torchrl_caiac.influence.mixture_divergence import (
     kernel_pays,
     mixture_influence,
 )
+from torchrl_caiac.modules._action_bounds import (
+    bounds_text,
+    differing_bounds,
+    spec_bounds,
+)
 from torchrl_caiac.modules.entity_dynamics_model import evaluating
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 
@@ -92,8 +97,10 @@ class CAI(nn.Module):
         num_actions (int): the number of actions, ``K``. Defaults to 64.
 
     Keyword Args:
-        action_spec (Bounded, optional): the action space, ``[A]``. Defaults to [-1, 1]
-            in every dimension.
+        action_spec (Bounded, optional): the action space, ``[A]``. Defaults to the
+            bounds that :func:`~torchrl_caiac.fit.fit_world_model` recorded in the
+            model or, with a warning, to [-1, 1] if there are none. A warning says so if
+            it differs from the recorded ones.
         seed (int): the seed of the actions. Defaults to 0.
         generator (torch.Generator, optional): draws the actions instead of ``seed``.
         approximation (str): as in
@@ -113,21 +120,30 @@ class CAI(nn.Module):
         actions (torch.Tensor): the actions, ``[K, A]``.
 
     Raises:
-        ValueError: the model does not predict an entity; the action spec has another
-            size or infinite bounds; ``num_actions`` is below 2; the fast mode has no
-            positive threshold, or at most 16 actions.
+        ValueError: the model was never fitted or does not predict an entity; the action
+            spec has another size or infinite bounds; ``num_actions`` is below 2; the
+            fast mode has no positive threshold, or at most 16 actions.
         TypeError: the model is not Gaussian, or the action spec is not bounded.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
         >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.fit import fit_world_model
         >>> from torchrl_caiac.influence.cai import CAI
         >>> from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
         >>> layout = EntityLayout({"arm": [0, 1], "cup": [2]})
-        >>> estimator = CAI(GaussianWorldModel(layout, 2, (16, 16)), num_actions=8)
-        >>> estimator(TensorDict({"observation": torch.randn(5, 3)}, [5])).shape
-        torch.Size([5, 2])
+        >>> model = GaussianWorldModel(layout, 2, (16, 16))
+        >>> data = TensorDict({
+        ...     "observation": torch.randn(50, 3), "action": torch.rand(50, 2),
+        ...     "episode": torch.arange(50) // 10,
+        ...     "next": {"observation": torch.randn(50, 3)}}, [50])
+        >>> _ = fit_world_model(
+        ...     model, data, steps=10, action_spec=Bounded(-1, 1, (2,)), progress=False
+        ... )
+        >>> CAI(model, num_actions=8)(data).shape
+        torch.Size([50, 2])
     """
 
     actions: torch.Tensor
@@ -183,7 +199,12 @@ class CAI(nn.Module):
                 f"the model predicts no column of {missing}: every entity needs a "
                 "score, predict at least one column of each"
             )
-        low, high = _bounds(action_spec, model.action_dim)
+        if not model.fitted:
+            raise ValueError(
+                "the model was never fitted, so that its scores would mean nothing: "
+                "call fit_world_model(model, data), or load a fitted one, first"
+            )
+        low, high = _bounds(model, action_spec)
         if generator is None:
             generator = torch.Generator().manual_seed(seed)
         self.model = model
@@ -394,25 +415,31 @@ def _spread(actions: torch.Tensor, count: int) -> list[int]:
     return chosen
 
 
-def _bounds(spec: Bounded | None, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    if spec is None:
-        return -torch.ones(size), torch.ones(size)
-    if not isinstance(spec, Bounded):
-        raise TypeError(
-            f"action_spec must be a torchrl Bounded spec, got {type(spec).__name__}: "
-            "only a bounded action space has a uniform distribution"
-        )
-    if tuple(spec.shape) != (size,):
-        raise ValueError(
-            f"action_spec has the shape {list(spec.shape)}, but the model's actions "
-            f"are [{size}]: pass the spec of one environment "
-            "(env.full_action_spec_unbatched)"
-        )
-    low = spec.space.low.expand(size)
-    high = spec.space.high.expand(size)
-    if not bool(torch.isfinite(low).all() and torch.isfinite(high).all()):
-        raise ValueError(
-            f"action_spec has infinite bounds, low {low.tolist()} and high "
-            f"{high.tolist()}: give finite ones"
-        )
-    return low, high
+def _bounds(
+    model: GaussianWorldModel, spec: Bounded | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the bounds between which actions are drawn, ``[A]`` each."""
+    known = model.action_bounds
+    if known is not None:
+        known = known[0].cpu(), known[1].cpu()
+    if spec is not None:
+        given = spec_bounds(spec, model.action_dim)
+        given = given[0].cpu(), given[1].cpu()
+        columns = [] if known is None else differing_bounds(given, known)
+        if known is not None and columns:
+            warnings.warn(
+                f"action_spec has the bounds {bounds_text(given)}, but the model was "
+                f"fitted to actions in {bounds_text(known)}, which differ in the "
+                f"columns {columns}: what the model has not seen is extrapolated. "
+                "Leave action_spec out, or fit the model to data with these actions",
+                stacklevel=3,
+            )
+        return given
+    if known is not None:
+        return known
+    warnings.warn(
+        "the bounds of the actions are not known, and actions are drawn from [-1, 1]: "
+        "pass action_spec, or fit the model with fit_world_model, which records them",
+        stacklevel=3,
+    )
+    return -torch.ones(model.action_dim), torch.ones(model.action_dim)

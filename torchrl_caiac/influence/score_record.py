@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 
-from torchrl_caiac._files import write_json
+from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 from torchrl_caiac._keys import jsonable, path
 from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.entities import EntityLayout
@@ -69,7 +69,8 @@ def read_record(
         others; ``None`` where there is no record.
 
     Raises:
-        ValueError: the file is damaged, or is not a score file of this version.
+        UnreadableFileError: the file is damaged, or is not a score file of this
+            version.
     """
     folder = _folder(data)
     if folder is None:
@@ -81,23 +82,20 @@ def read_record(
         "call score_buffer(..., overwrite=True) to recompute the scores, or delete the "
         "file together with the scores"
     )
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(
-            f"the score file {file} is truncated or damaged ({error}): {remedy}"
-        ) from error
+    record = read_json(file, "score file", remedy)
     if not isinstance(record, dict) or record.get("format") != _FORMAT:
-        raise ValueError(f"{file} is not a score file of torchrl_caiac: {remedy}")
+        raise UnreadableFileError(
+            f"{file} is not a score file of torchrl_caiac: {remedy}"
+        )
     if record.get("version") != _VERSION:
-        raise ValueError(
+        raise UnreadableFileError(
             f"the score file {file} has version {record.get('version')!r}, this "
             f"package reads {_VERSION}: update torchrl_caiac, or {remedy}"
         )
     if record.get("state") not in _STATES or not isinstance(
         record.get("settings"), dict
     ):
-        raise ValueError(f"the score file {file} is incomplete: {remedy}")
+        raise UnreadableFileError(f"the score file {file} is incomplete: {remedy}")
     return record
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar
@@ -13,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_caiac._keys import as_key, jsonable, key_from_json
+from torchrl_caiac._keys import as_key, floating, jsonable, key_from_json
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._predicted_columns import (
     checked_floor,
@@ -69,6 +70,9 @@ class EntityDynamicsModel(TensorDictModuleBase):
         predicted (dict of str to slice): the position of each predicted entity in
             ``P``.
         slices (dict of str to slice): the position of each entity in ``W``.
+        action_low (torch.Tensor): float32 ``[A]``, the lowest action, as recorded by
+            :meth:`set_action_bounds`; NaN if unknown.
+        action_high (torch.Tensor): float32 ``[A]``, the highest action.
 
     Raises:
         ValueError: an argument does not fit the layout.
@@ -146,6 +150,11 @@ class EntityDynamicsModel(TensorDictModuleBase):
         zeros = torch.zeros(self.predict_dim, dtype=torch.float64)
         self.register_buffer("target_loc", zeros)
         self.register_buffer("target_scale", torch.ones_like(zeros))
+        self.action_low: torch.Tensor
+        self.action_high: torch.Tensor
+        unknown = torch.full((action_dim,), math.nan, dtype=torch.float32)
+        self.register_buffer("action_low", unknown)
+        self.register_buffer("action_high", unknown.clone())
 
     @property
     def dtype(self) -> torch.dtype:
@@ -247,8 +256,10 @@ class EntityDynamicsModel(TensorDictModuleBase):
         Returns:
             torch.Tensor: ``[*B, P]``.
         """
-        after = next_state[..., self.index]
-        return after - state[..., self.index] if self.target == "change" else after
+        after = floating(next_state[..., self.index])
+        if self.target != "change":
+            return after
+        return after - floating(state[..., self.index])
 
     def normalise(self, raw: torch.Tensor) -> torch.Tensor:
         """Normalises raw targets, in the dtype of the parameters.
@@ -263,6 +274,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
             RuntimeError: :meth:`fit_statistics` was not called.
         """
         self._check_fitted()
+        raw = floating(raw)
         loc, scale = (x.to(raw.dtype) for x in (self.target_loc, self.target_scale))
         return ((raw - loc) / scale).to(self.dtype)
 
@@ -281,7 +293,9 @@ class EntityDynamicsModel(TensorDictModuleBase):
         """
         self._check_fitted()
         raw = loc * self.target_scale.to(loc.dtype) + self.target_loc.to(loc.dtype)
-        return raw + state[..., self.index] if self.target == "change" else raw
+        if self.target != "change":
+            return raw
+        return raw + floating(state[..., self.index])
 
     def targets(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Returns the normalised targets of transitions.
@@ -337,6 +351,51 @@ class EntityDynamicsModel(TensorDictModuleBase):
         if self.target == "absolute":
             self.target_loc.copy_(stats.mean)
         self.fitted = True
+
+    @property
+    def action_bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """The lowest and the highest action, ``[A]`` each; ``None`` if unknown."""
+        if bool(self.action_low.isnan().any() | self.action_high.isnan().any()):
+            return None
+        return self.action_low, self.action_high
+
+    def set_action_bounds(
+        self,
+        low: torch.Tensor | Sequence[float] | float,
+        high: torch.Tensor | Sequence[float] | float,
+    ) -> None:
+        """Records the bounds of the actions, which are saved with the model.
+
+        :func:`~torchrl_caiac.fit.fit_world_model` calls it.
+
+        Args:
+            low (torch.Tensor, sequence of float or float): the lowest action, ``[A]``
+                or one number.
+            high (torch.Tensor, sequence of float or float): the highest action.
+
+        Raises:
+            ValueError: a bound is not finite, or a lower one is above a higher one.
+
+        Examples:
+            >>> from torchrl_caiac import EntityLayout
+            >>> from torchrl_caiac.modules import GaussianWorldModel
+            >>> model = GaussianWorldModel(EntityLayout({"arm": [0]}), 2, (8,))
+            >>> model.set_action_bounds(-1.0, [1.0, 2.0])
+            >>> model.action_bounds
+            (tensor([-1., -1.]), tensor([1., 2.]))
+        """
+        device = self.action_low.device
+        low, high = (
+            torch.as_tensor(x, dtype=torch.float32, device=device) for x in (low, high)
+        )
+        # Written so that NaN fails too.
+        if not bool((low.isfinite() & high.isfinite() & (low <= high)).all()):
+            raise ValueError(
+                f"the lowest action {low.tolist()} and the highest {high.tolist()} "
+                "must be finite, and none of the lowest above the highest"
+            )
+        self.action_low.copy_(low)
+        self.action_high.copy_(high)
 
     def _raw_chunks(self, data: Any) -> Iterator[torch.Tensor]:
         layout, device = self.layout, self.target_loc.device
@@ -488,6 +547,11 @@ class EntityDynamicsModel(TensorDictModuleBase):
                     f"the saved world model has another {name}, saved:\n"
                     f"{found.get(name)}\nthis model:\n{value}\nCreate the model with "
                     f"the saved arguments ({found['class']}.from_config)"
+                )
+            if f"{prefix}action_low" not in state_dict:
+                raise ValueError(
+                    "the saved world model is of an earlier version, which did not "
+                    "record the bounds of the actions: fit it again"
                 )
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 

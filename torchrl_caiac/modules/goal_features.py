@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._keys import as_key, get_leaf
+from torchrl_caiac._keys import as_key, floating, get_leaf
 from torchrl_caiac._layout_reading import check_width
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.running_norm import RunningNorm, gather_statistics
@@ -248,6 +248,7 @@ class GoalFeatures(TensorDictModuleBase):
                 f"{self.desired_goal_key!r} has {goal.shape[-1]} columns, expected "
                 f"{layout.goal_width}: correct the layout's goal, or the data"
             )
+        observation, goal = floating(observation), floating(goal)
         whole = self._whole and observation.shape[-1] == self.state_dim
         parts = [observation if whole else self._pick(observation, "state"), goal]
         if self.relative:

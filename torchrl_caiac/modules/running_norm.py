@@ -8,6 +8,8 @@ import torch
 from tensordict.utils import NestedKey
 from torch import nn
 
+from torchrl_caiac._keys import floating
+
 __all__ = ["RunningNorm", "gather_statistics"]
 
 _ROWS_PER_CHUNK = 65_536
@@ -197,6 +199,7 @@ class RunningNorm(nn.Module):
         else:
             self._check(x)
         # In float64, features far from zero keep their small differences.
+        x = floating(x)
         x = x - (self.mean if x.dtype == torch.float64 else self.shift)
         # A quotient rounds once. A product is faster, but rounds twice.
         x = x / self.divisor if self.frozen else x * self.gain
@@ -265,7 +268,7 @@ def gather_statistics(
         stop = min(start + _ROWS_PER_CHUNK, len(value))
         rows = value[start:stop]
         valid = None if mask is None else mask.reshape(-1)[start:stop]
-        rows = rows if valid is None else rows[valid]
+        rows = floating(rows if valid is None else rows[valid])
         finite = rows.isfinite()
         if not finite.all():
             raise ValueError(

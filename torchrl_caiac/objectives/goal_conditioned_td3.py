@@ -16,10 +16,13 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import priority_weight, reduce_loss, vmap_loss
+from torchrl_caiac.modules._action_bounds import check_actions
 from torchrl_caiac.modules.goal_features import read_leaves
 from torchrl_caiac.modules.goal_networks import takes_params
 
 __all__ = ["GoalConditionedTD3Loss"]
+
+_ACTION_CHECKS = 10  # calls of a loss in which the actions are checked
 
 
 class GoalConditionedTD3Loss(TD3Loss):
@@ -39,6 +42,9 @@ class GoalConditionedTD3Loss(TD3Loss):
       ``λ = bc_alpha / mean |Q|``. Transitions can be left out of the latter:
       counterfactual ones contain the action of the expert before the swap.
     - The loss of the policy evaluates the first critic only.
+    - Actions of the data outside of their bounds are an error: the policy cannot return
+      them. The first ten calls are checked, on an accelerator only the first one, and
+      none of a compiled loss.
     - The networks of this package are called with the parameters of the loss, those of
       all critics at once, which saves a fifth of the time of a step. Parameters of
       other networks are swapped in and out as in TorchRL, with ``deactivate_vmap``.
@@ -86,7 +92,8 @@ class GoalConditionedTD3Loss(TD3Loss):
 
     Raises:
         ValueError: bounds are given twice or out of order, a weight is negative, or
-            there is a ``bc_mask_key`` without ``bc_alpha``.
+            there is a ``bc_mask_key`` without ``bc_alpha``; in a call, an action is
+            outside of the bounds by more than 1e-3 of their width.
 
     Examples:
         >>> import torch
@@ -212,6 +219,7 @@ class GoalConditionedTD3Loss(TD3Loss):
         self.bc_mask_key = None if bc_mask_key is None else as_key(bc_mask_key)
         if bc_alpha is not None:
             self.out_keys = [*self.out_keys, "bc_loss", "lmbd"]
+        self._action_checks = _ACTION_CHECKS
 
     # --- keys --------------------------------------------------------------------
 
@@ -304,6 +312,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             ``"state_action_value_actor"`` ``[*B]`` and, with ``bc_alpha``, the scalars
             ``"bc_loss"`` and ``"lmbd"``.
         """
+        self._check_actions(tensordict)
         weights = priority_weight(self, tensordict)
         inputs = self._inputs(tensordict, self._state_keys)
         inputs = _call(self.actor_network, inputs, self.actor_network_params)
@@ -340,6 +349,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             ``"pred_value"`` ``[C, *B]``, ``"next_state_value"`` and ``"target_value"``
             ``[*B]``.
         """
+        self._check_actions(tensordict)
         keys = self.tensor_keys
         weights = priority_weight(self, tensordict)
         inputs = self._inputs(tensordict, [*self._state_keys, keys.action])
@@ -426,6 +436,24 @@ class GoalConditionedTD3Loss(TD3Loss):
         return error * (kept.numel() / kept.sum().clamp_min(1))
 
     # --- reading -----------------------------------------------------------------
+
+    def _check_actions(self, tensordict: TensorDictBase) -> None:
+        # A compiled loss cannot raise errors that depend on values.
+        if torch.compiler.is_compiling() or not self._action_checks:
+            return
+        (action,) = read_leaves(tensordict, [self.tensor_keys.action])
+        check_actions(
+            action,
+            self.min_action,
+            self.max_action,
+            self.tensor_keys.action,
+            tolerance=1e-3,
+            remedy="give bounds or action_spec of these actions (and low and high of "
+            "the policy), or rescale the actions of the data",
+        )
+        # On an accelerator the host waits for the result, so only once.
+        on_cpu = action.device.type == "cpu"
+        self._action_checks = self._action_checks - 1 if on_cpu else 0
 
     def _inputs(
         self,

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from torchrl_caiac._keys import floating
 from torchrl_caiac._random import draw_numbers
 from torchrl_caiac._torchrl import loss_masks
 from torchrl_caiac.modules.lmp import LMPModel, read_leaf
@@ -319,9 +320,14 @@ class LMPLoss(LossModule):
         self, tensordict: TensorDictBase
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         model, keys = self.model, self.tensor_keys
-        observation = read_leaf(tensordict, keys.observation, model.observation_dim)
-        action = read_leaf(tensordict, keys.action, model.action_dim)
-        goal = read_leaf(tensordict, keys.desired_goal, model.goal_dim)
+        observation, action, goal = (
+            floating(read_leaf(tensordict, key, width))
+            for key, width in (
+                (keys.observation, model.observation_dim),
+                (keys.action, model.action_dim),
+                (keys.desired_goal, model.goal_dim),
+            )
+        )
         if observation.ndim < 2:
             raise ValueError(
                 f"{keys.observation!r} has the shape {list(observation.shape)}, "

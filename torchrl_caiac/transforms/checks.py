@@ -16,7 +16,6 @@ __all__ = [
     "check_generator",
     "check_layout",
     "check_number",
-    "check_reward_fn",
     "check_window",
 ]
 
@@ -104,16 +103,6 @@ def check_generator(generator: Any) -> torch.Generator | None:
             f"generator must be a torch.Generator, got {type(generator).__name__}"
         )
     return generator
-
-
-def check_reward_fn(reward_fn: Any) -> Any:
-    """Returns a function, or raises a ``TypeError``."""
-    if not callable(reward_fn):
-        raise TypeError(
-            "reward_fn must be a function of the next achieved and desired goals, got "
-            f"{type(reward_fn).__name__}"
-        )
-    return reward_fn
 
 
 # --- values --------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from torchrl_caiac.transforms.components import (
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
-from torchrl_caiac.transforms.rewards import RewardFn
+from torchrl_caiac.transforms.rewards import RewardFn, TerminatedFn
 
 __all__ = ["CoDATransform"]
 
@@ -65,13 +65,19 @@ class CoDATransform(CounterfactualTransform):
             :attr:`unscored_count` counts them. Defaults to ``"raise"``.
         reward_fn (callable, optional): ``(next_achieved [C, G], desired [C, G])`` to
             rewards ``[C]`` or ``[C, 1]``; recomputes the rewards of counterfactual
-            rows. Defaults to ``None``: the stored rewards are kept.
+            rows. Other forms, such as Gymnasium's ``compute_reward``, and the dtype of
+            the rewards are as in :class:`~torchrl_caiac.transforms.HindsightGoal`.
+            Defaults to ``None``: the stored rewards are kept.
+        terminated_fn (callable, optional): the same forms, to bool ``[C]`` or
+            ``[C, 1]``; recomputes the end flags of counterfactual rows, for tasks that
+            end at their goal. Defaults to ``None``: end flags are kept, and with a
+            ``reward_fn`` a warning says so once if some of them end the task.
         goals (WindowGoal, optional): draws the goals of donor windows of a donor
             buffer; without it they are the stored ones.
         generator (torch.Generator, optional): source of randomness. Defaults to
             torch's default generator. The same state gives the same batch.
-        keys (TransformKeys, optional): rewards, trajectory ids, end flags and the
-            flags that are written. Defaults to ``TransformKeys()``.
+        keys (TransformKeys, optional): rewards, actions, trajectory ids, end flags and
+            the flags that are written. Defaults to ``TransformKeys()``.
         check (bool): check the values of each batch: graphs, windows, observations; on
             a CUDA device an error is raised at a later sample. Defaults to ``True``.
 
@@ -121,6 +127,7 @@ class CoDATransform(CounterfactualTransform):
         graph_key: NestedKey = ("coda", "graph"),
         unscored: Literal["raise", "keep"] = "raise",
         reward_fn: RewardFn | None = None,
+        terminated_fn: TerminatedFn | None = None,
         goals: WindowGoal | None = None,
         generator: torch.Generator | None = None,
         keys: TransformKeys | None = None,
@@ -137,6 +144,7 @@ class CoDATransform(CounterfactualTransform):
             score_key=graph_key,
             unscored=unscored,
             reward_fn=reward_fn,
+            terminated_fn=terminated_fn,
             goals=goals,
             generator=generator,
             keys=keys,

@@ -23,14 +23,18 @@ from torchrl_caiac.transforms.checks import (
     check_generator,
     check_layout,
     check_number,
-    check_reward_fn,
     check_window,
 )
 from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
-from torchrl_caiac.transforms.rewards import RewardFn, recompute_reward
+from torchrl_caiac.transforms.rewards import (
+    GoalLeaves,
+    RewardFn,
+    TerminatedFn,
+    goal_vectors,
+)
 from torchrl_caiac.transforms.swap import SwapPlan, SwapPlanner, apply_swap
 
 __all__ = ["CounterfactualTransform"]
@@ -62,6 +66,7 @@ class CounterfactualTransform(BufferTransform, ABC):
         unscored (str): what happens to rows without valid scores: ``"raise"`` or
             ``"keep"``.
         reward_fn (callable, optional): recomputes rewards of counterfactual rows.
+        terminated_fn (callable, optional): recomputes their end flags.
         goals (WindowGoal, optional): draws the goals of donor windows.
         generator (torch.Generator, optional): source of randomness.
         keys (TransformKeys, optional): the other keys.
@@ -86,6 +91,7 @@ class CounterfactualTransform(BufferTransform, ABC):
         score_key: NestedKey,
         unscored: Literal["raise", "keep"],
         reward_fn: RewardFn | None,
+        terminated_fn: TerminatedFn | None = None,
         goals: WindowGoal | None,
         generator: torch.Generator | None,
         keys: TransformKeys | None,
@@ -106,10 +112,12 @@ class CounterfactualTransform(BufferTransform, ABC):
         self.swap_prob = check_number("swap_prob", swap_prob, 1.0)
         self.window = check_window(window)
         self.score_key = as_key(score_key)
-        self.reward_fn = None if reward_fn is None else check_reward_fn(reward_fn)
         self.generator = check_generator(generator)
         self.keys = keys or TransformKeys()
         self.check = bool(check)
+        self._goal_leaves = GoalLeaves(
+            reward_fn, terminated_fn, keys=self.keys, check=self.check
+        )
         if goals is not None:
             self._check_goals(goals, donors)
         # In a tuple, so that torch does not register the goals as a submodule.
@@ -139,16 +147,15 @@ class CounterfactualTransform(BufferTransform, ABC):
         self._unscored = torch.zeros((), dtype=torch.int64)
         self._knows_buffer = self.chosen_rows == "last"
         swapped = self._planner.keys
-        rewards = [] if reward_fn is None else [self.keys.reward]
         self.in_keys = [
             *swapped,
             self.score_key,
             fingerprint_key(self.score_key),
-            *rewards,
+            *self._goal_leaves.in_keys,
         ]
         self.out_keys = [
             *swapped,
-            *rewards,
+            *self._goal_leaves.out_keys,
             self.keys.counterfactual,
             self.keys.swapped,
         ]
@@ -188,6 +195,16 @@ class CounterfactualTransform(BufferTransform, ABC):
         """
 
     # --- settings and state ----------------------------------------------------------
+
+    @property
+    def reward_fn(self) -> RewardFn | None:
+        """The function that recomputes rewards."""
+        return self._goal_leaves.reward_fn
+
+    @property
+    def terminated_fn(self) -> TerminatedFn | None:
+        """The function that recomputes end flags."""
+        return self._goal_leaves.terminated_fn
 
     @property
     def donors(self) -> ReplayBuffer | TensorStorage | None:
@@ -323,22 +340,24 @@ class CounterfactualTransform(BufferTransform, ABC):
         keys, swapped = self.keys, draw.swapped
         total, window = td.shape[0], self.window
         drawn = swapped.shape[0]
+        first = total - drawn * window
         chosen = draw.chosen
-        if chosen is None:
-            chosen = swapped.new_ones(drawn)
         if window > 1:
             swapped = swapped.unsqueeze(1).expand(-1, window, -1).flatten(0, 1)
-            chosen = chosen.unsqueeze(1).expand(-1, window).flatten()
+            if chosen is not None:
+                chosen = chosen.unsqueeze(1).expand(-1, window).flatten()
+        if self._goal_leaves and drawn:
+            goals = goal_vectors(out, self.layout, first)
+            leaves = self._goal_leaves(out, *goals, first=first, where=chosen)
+            for key, leaf in leaves.items():
+                out.set(key, leaf)
+        if chosen is None:
+            chosen = swapped.new_ones(drawn * window)
         chosen = chosen.unsqueeze(-1)
-        if drawn * window < total:
-            kept = swapped.new_zeros(total - drawn * window, swapped.shape[-1])
+        if first:
+            kept = swapped.new_zeros(first, swapped.shape[-1])
             swapped = torch.cat([kept, swapped])
             chosen = torch.cat([kept[:, :1], chosen])
-        if self.reward_fn is not None and drawn:
-            reward = recompute_reward(
-                out, self.layout, self.reward_fn, chosen, reward_key=keys.reward
-            )
-            out.set(keys.reward, reward)
         out.set(keys.counterfactual, chosen)
         out.set(keys.swapped, swapped)
         return out

@@ -31,6 +31,12 @@ class TransformKeys:
             to ``("caiac", "swapped")``.
         relabeled (NestedKey): the flag of transitions with another goal, bool
             ``[*B, 1]``. Defaults to ``("hindsight", "relabeled")``.
+        action (NestedKey): the actions, ``[*B, K]``, for reward functions that need
+            them. Defaults to ``"action"``.
+        terminated (NestedKey): the flags of transitions that end the task, ``[*B]`` or
+            ``[*B, 1]``. Defaults to ``("next", "terminated")``.
+        truncated (NestedKey): the flags of transitions after which the trajectory was
+            cut off, ``[*B]`` or ``[*B, 1]``. Defaults to ``("next", "truncated")``.
 
     Raises:
         TypeError: a key is not a ``str`` or a tuple of them.
@@ -48,6 +54,9 @@ class TransformKeys:
     counterfactual: NestedKey = ("caiac", "counterfactual")
     swapped: NestedKey = ("caiac", "swapped")
     relabeled: NestedKey = ("hindsight", "relabeled")
+    action: NestedKey = "action"
+    terminated: NestedKey = ("next", "terminated")
+    truncated: NestedKey = ("next", "truncated")
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -9,14 +9,21 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._keys import floating
 from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
-from torchrl_caiac.transforms.checks import check_number, check_reward_fn
+from torchrl_caiac.transforms.checks import check_number
 from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
 from torchrl_caiac.transforms.indexing import pick_rows
 from torchrl_caiac.transforms.keys import TransformKeys
-from torchrl_caiac.transforms.rewards import RewardFn, call_reward, stored_reward
+from torchrl_caiac.transforms.rewards import (
+    GoalLeaves,
+    RewardFn,
+    TerminatedFn,
+    holds,
+    stored_reward,
+)
 
 __all__ = ["HindsightDraw", "HindsightGoal"]
 
@@ -51,8 +58,10 @@ class HindsightGoal(FutureGoal):
 
     The rewards of relabelled and of counterfactual transitions are recomputed by
     ``reward_fn`` from the *next* achieved goal, so
-    :class:`~torchrl_caiac.CAIACTransform` needs no ``reward_fn`` of its own. End flags
-    stay as they were stored: this is meant for tasks that do not end at their goal.
+    :class:`~torchrl_caiac.CAIACTransform` needs no ``reward_fn`` of its own. So are
+    their end flags if there is a ``terminated_fn``, for tasks that end at their goal.
+    Without it they stay as they were stored, and a warning says so once if some of them
+    end the task.
 
     Append it after the augmentation; in the other order the augmentation raises.
 
@@ -75,10 +84,23 @@ class HindsightGoal(FutureGoal):
     Args:
         layout (EntityLayout): the entities and their goals.
         reward_fn (callable): ``(next_achieved [B, G], desired [B, G])`` to rewards
-            ``[B]`` or ``[B, 1]``. A nested layout's goals are concatenated, flattened,
-            in layout order.
+            ``[B]`` or ``[B, 1]``, with tensors. Or the form of Gymnasium,
+            ``compute_reward(achieved_goal, desired_goal, info)``, such as
+            ``env.unwrapped.compute_reward``, with NumPy arrays and an empty ``info``;
+            goals on a CUDA device are copied to the host for it, which waits for them.
+            In both forms a further parameter named ``action`` gets the actions
+            ``[B, K]``. Goals that are stored as integers are passed in floating point;
+            a nested layout's goals are concatenated, flattened, in layout order.
+            Rewards keep the stored dtype if it holds what the function returns, else
+            (integers, and a function with fractions) all rewards of the batch are in
+            torch's default dtype.
 
     Keyword Args:
+        terminated_fn (callable, optional): the same forms, to bool ``[B]`` or
+            ``[B, 1]``: whether the task ends at this transition. It sets
+            ``keys.terminated`` of relabelled and counterfactual transitions, and their
+            ``keys.done`` (unless it is ``None``) to terminated or truncated. Defaults
+            to ``None``: end flags are kept.
         future (float): share of real transitions with a goal of their future. Defaults
             to 0.5.
         random (float): share of real transitions with a goal of another one; the sum of
@@ -92,13 +114,14 @@ class HindsightGoal(FutureGoal):
         p (float): the parameter of ``"geometric"``. Defaults to 0.2.
         generator (torch.Generator, optional): source of randomness. Defaults to
             torch's default generator. The same state gives the same batch.
-        keys (TransformKeys, optional): rewards, trajectory ids, end flags, the flag of
-            counterfactuals that is read and the flag ``relabeled``, bool ``[B, 1]``,
-            that is written. Defaults to ``TransformKeys()``.
+        keys (TransformKeys, optional): rewards, actions, trajectory ids, end flags,
+            the flag of counterfactuals that is read and the flag ``relabeled``, bool
+            ``[B, 1]``, that is written. Defaults to ``TransformKeys()``.
 
     Raises:
         TypeError: an argument has the wrong type.
-        ValueError: an argument is out of range, or the layout has no goals.
+        ValueError: an argument is out of range, the layout has no goals, or a function
+            has other parameters.
 
     Examples:
         >>> import torch
@@ -134,6 +157,7 @@ class HindsightGoal(FutureGoal):
         layout: EntityLayout,
         reward_fn: RewardFn,
         *,
+        terminated_fn: TerminatedFn | None = None,
         future: float = 0.5,
         random: float = 0.0,
         counterfactual: float = 0.5,
@@ -147,7 +171,9 @@ class HindsightGoal(FutureGoal):
             raise ValueError(
                 f"strategy must be 'geometric' or 'uniform', got {strategy!r}"
             )
-        self.reward_fn = check_reward_fn(reward_fn)
+        if reward_fn is None:
+            raise TypeError("reward_fn must be a function of goals, got None")
+        self._goal_leaves = GoalLeaves(reward_fn, terminated_fn, keys=self.keys)
         self.future = check_number("future", future, 1.0)
         self.random = check_number("random", random, 1.0)
         self.counterfactual = check_number("counterfactual", counterfactual, 1.0)
@@ -160,10 +186,24 @@ class HindsightGoal(FutureGoal):
         self.in_keys = [
             *self.achieved_keys,
             *self.goal_keys,
-            self.keys.reward,
+            *self._goal_leaves.in_keys,
             self.keys.counterfactual,
         ]
-        self.out_keys = [*self.goal_keys, self.keys.reward, self.keys.relabeled]
+        self.out_keys = [
+            *self.goal_keys,
+            *self._goal_leaves.out_keys,
+            self.keys.relabeled,
+        ]
+
+    @property
+    def reward_fn(self) -> RewardFn | None:
+        """The function that recomputes rewards."""
+        return self._goal_leaves.reward_fn
+
+    @property
+    def terminated_fn(self) -> TerminatedFn | None:
+        """The function that recomputes end flags."""
+        return self._goal_leaves.terminated_fn
 
     # --- drawing ---------------------------------------------------------------------
 
@@ -270,20 +310,21 @@ class HindsightGoal(FutureGoal):
         for key, reached in achieved.items():
             desired = self._desired(td, key, reached)
             # Stored integers must not cut the goals that are reached.
-            cuts = reached.is_floating_point() and not desired.is_floating_point()
-            desired = desired.to(reached.dtype) if cuts else desired
+            if not holds(desired.dtype, reached.dtype):
+                desired = floating(desired).to(floating(reached).dtype)
             parts = [desired, reached.to(desired)]
             if draw.future is not None:
                 parts.append(draw.future[key].to(desired))
             goals[key] = torch.cat(parts).index_select(0, draw.source)
-        old = stored_reward(td, self.keys.reward)
-        reward = call_reward(self.reward_fn, _vector(achieved), _vector(goals), old)
         is_new = relabeled if flags is None else relabeled | flags
+        leaves = self._goal_leaves(
+            td, _vector(achieved), _vector(goals), where=is_new.reshape(-1)
+        )
         after = {self.layout.next(key): goal for key, goal in goals.items()}
         return {
             **goals,
             **{k: goal for k, goal in after.items() if td.get(k, None) is not None},
-            self.keys.reward: torch.where(is_new.view_as(old), reward, old),
+            **leaves,
             self.keys.relabeled: relabeled,
         }
 
@@ -370,7 +411,8 @@ class HindsightGoal(FutureGoal):
         all transforms, from a uniformly drawn later row of the trajectory. With
         ``her_ratio`` at most ``1 - counterfactual_ratio`` these are real rows, and a
         ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones after them.
-        The flag in :attr:`relabeled_key` is set for both. That buffer identifies
+        The flag ``keys.relabeled`` is set for both, and so are end flags if there is a
+        ``terminated_fn``. That buffer identifies
         trajectories by their end flags only, and in TorchRL 0.14 it must not be written
         to once it is full.
 
@@ -428,9 +470,10 @@ class HindsightGoal(FutureGoal):
         if relabeled is not None:
             relabeled.fill_(True)  # a view of the batch's flag, like all of these rows
         stored = stored_reward(tensordict, self.keys.reward)
-        reward = call_reward(
-            self.reward_fn, _vector(achieved), _vector(desired), stored
-        )
+        leaves = self._goal_leaves(tensordict, _vector(achieved), _vector(desired))
+        reward = leaves.pop(self.keys.reward)
+        for key, flags in leaves.items():
+            tensordict.get(key).copy_(flags)  # views as well
         if reward.dtype != stored.dtype:
             raise ValueError(
                 f"{self.keys.reward!r} is stored as {stored.dtype}, in which "

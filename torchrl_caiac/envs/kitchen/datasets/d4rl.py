@@ -12,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
+from torchrl_caiac._files import UnreadableFileError
+from torchrl_caiac.data.minari_checks import check_hdf5_array
 from torchrl_caiac.data.write_transitions import check_free, write_transitions
 
 __all__ = ["load_d4rl_kitchen"]
@@ -121,18 +123,19 @@ def _read_d4rl(file: Path) -> dict[str, NDArray[Any]]:
                     "file of D4RL"
                 )
             for name in _D4RL_ARRAYS:
+                check_hdf5_array(stored[name], file)
                 arrays[name] = np.asarray(stored[name])
     except OSError as error:
-        raise ValueError(
+        raise UnreadableFileError(
             f"{file} is not an HDF5 file or is truncated ({error}): download it again"
         ) from error
-    length = len(arrays["observations"])
+    length = arrays["observations"].shape[:1]
     for name, shape in _D4RL_ARRAYS.items():
         array = arrays[name]
-        if array.shape != (length, *shape):
+        if array.shape != (*length, *shape):
             raise ValueError(
                 f"{name!r} in {file} has shape {array.shape}, expected "
-                f"{(length, *shape)}"
+                f"{(*length, *shape)}"
             )
         if not np.isfinite(array).all():
             raise ValueError(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
+from torchrl_caiac.data.minari_checks import episode_lengths
 from torchrl_caiac.data.minari_files import (
     free_dataset_path,
     open_minari,
@@ -169,7 +170,8 @@ def create_kitchen_random(
 class _RandomSource(KitchenSource):
     def __init__(self, states: str) -> None:
         super().__init__(DEFAULT_TASKS)
-        self.states = np.load(states)
+        # Mapped: an array's header could ask for any amount of memory.
+        self.states = np.load(states, mmap_mode="r", allow_pickle=False)
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any]:
         rng = np.random.default_rng([seed, 1])
@@ -179,8 +181,8 @@ class _RandomSource(KitchenSource):
             # The environment without its wrappers: they count steps over episodes.
             observation = set_kitchen_start(
                 self.env,
-                qpos=self.states[start, :30],
-                qvel=self.states[start, 30:],
+                qpos=np.array(self.states[start, :30]),
+                qvel=np.array(self.states[start, 30:]),
             )
             episodes.append(
                 record_episode(
@@ -205,6 +207,7 @@ def _random_buffers(file: Path) -> Iterator[EpisodeBuffer]:
 def _simulator_states(dataset: MinariDataset) -> NDArray[np.float64]:
     """Returns positions and velocities ``[M, 59]`` of all states with an action."""
     states = []
+    episode_lengths(dataset)  # raises before an episode is read
     for episode in dataset.iterate_episodes():
         infos = episode.infos or {}
         missing = {"qpos", "qvel"} - set(infos)
@@ -221,6 +224,7 @@ def _simulator_states(dataset: MinariDataset) -> NDArray[np.float64]:
 
 def _same_array(file: Path, array: NDArray[Any]) -> bool:
     try:
-        return np.array_equal(np.load(file, allow_pickle=False), array)
+        stored = np.load(file, mmap_mode="r", allow_pickle=False)
+        return np.array_equal(stored, array)
     except (OSError, ValueError, EOFError):
         return False

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from torchrl_caiac.data.action_bounds import action_bounds
 from torchrl_caiac.data.load_minari import load_minari
+from torchrl_caiac.data.minari_checks import episode_lengths
 from torchrl_caiac.data.minari_files import open_minari
 from torchrl_caiac.data.write_transitions import check_free, write_transitions
 from torchrl_caiac.envs.kitchen.tasks import STATE_COLUMNS, task_number
@@ -83,6 +85,7 @@ def kitchen_transitions(
     check_free(path, overwrite)
     if isinstance(dataset, str):
         dataset = open_minari(dataset, root, download=download)
+    episode_lengths(dataset)  # raises before an episode is read
     indices = dataset.episode_indices
     known = dataset.storage.get_episode_metadata(indices)
     tasks = torch.tensor(
@@ -104,6 +107,7 @@ def kitchen_transitions(
                     f"{list(loaded[name].shape[1:])}, expected [{width}]: give a "
                     "dataset of FrankaKitchen-v1"
                 )
+        bounds = action_bounds(loaded)
         columns = list(STATE_COLUMNS)
         # In memory: the loaded files are deleted at the end of the block.
         rows = loaded.select("action", "episode").clone()
@@ -116,4 +120,4 @@ def kitchen_transitions(
             rows[key] = loaded["info", name].clone()
     if path is None:
         return rows
-    return write_transitions(rows, path, overwrite=overwrite)
+    return write_transitions(rows, path, overwrite=overwrite, action_bounds=bounds)

@@ -1,0 +1,198 @@
+"""Atomic writing of files and folders, and what killed processes left of it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import re
+import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = [
+    "remove_leftovers",
+    "remove_leftovers_in",
+    "whole_file",
+    "whole_folder",
+]
+
+_PARTIAL = ".partial-"
+_REPLACED = "replaced-"
+_in_use: set[Path] = set()  # the partial files and folders of this process
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str], *, tidy: bool = True) -> Iterator[Path]:
+    """Context manager that writes a file atomically.
+
+    The file replaces ``path`` at the end of the block. If the block raises, the old
+    file is unchanged. Missing parent folders are created.
+
+    Args:
+        path (path): the file to write.
+
+    Keyword Args:
+        tidy (bool): whether to call :func:`remove_leftovers` first, which lists the
+            whole folder. Defaults to ``True``.
+
+    Yields:
+        Path: a temporary file in the same folder, with the same suffix.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._whole_files import whole_file
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with whole_file(f"{folder}/results/table.txt") as partial:
+        ...         _ = partial.write_text("42")
+        ...     open(f"{folder}/results/table.txt").read()
+        '42'
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if tidy:
+        remove_leftovers(path)
+    with _partial(path) as partial:
+        try:
+            yield partial
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Context manager that writes a folder atomically.
+
+    The folder replaces ``path`` at the end of the block. If the block raises, the old
+    folder is unchanged. Missing parent folders are created.
+
+    Args:
+        path (path): the folder to write.
+
+    Yields:
+        Path: a temporary folder on the same file system, to be created in the block.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._whole_files import whole_folder
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with whole_folder(f"{folder}/data") as partial:
+        ...         partial.mkdir()
+        ...     os.path.isdir(f"{folder}/data")
+        True
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(path)
+    with _partial(path) as partial:
+        partial.mkdir()
+        made, replaced = partial / path.name, partial / f"{_REPLACED}{path.name}"
+        try:
+            yield made
+            was_there = path.exists()
+            if was_there:
+                os.replace(path, replaced)
+            try:
+                os.replace(made, path)
+            except OSError:
+                if was_there:
+                    os.replace(replaced, path)
+                raise
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def _partial(path: Path) -> Iterator[Path]:
+    """Yields a temporary path that names the process, and that nothing else uses."""
+    number = 0
+    while True:
+        owner = f"{_machine()}-{os.getpid()}.{number}"
+        partial = path.with_name(f"{_PARTIAL}{owner}-{path.name}")
+        if partial not in _in_use:
+            break
+        number += 1  # of another thread
+    _in_use.add(partial)
+    try:
+        yield partial
+    finally:
+        _in_use.discard(partial)
+
+
+def remove_leftovers(path: str | os.PathLike[str]) -> None:
+    """Removes the partial files and folders of processes that were killed.
+
+    Those of :func:`whole_file` and :func:`whole_folder` for this path are removed, and
+    those of other libraries whose names begin with them. What running processes write
+    stays, and so does what processes on other machines wrote. Nothing happens in a
+    read-only folder.
+
+    Args:
+        path (path): the file or folder that was to be written.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._whole_files import remove_leftovers, whole_file
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with whole_file(f"{folder}/table.txt") as partial:
+        ...         partial.touch()
+        ...         remove_leftovers(f"{folder}/table.txt")
+        ...         partial.exists()
+        True
+    """
+    path = Path(path)
+    _remove_leftovers(path.parent, re.escape(path.name))
+
+
+def remove_leftovers_in(folder: str | os.PathLike[str]) -> None:
+    """Removes what :func:`remove_leftovers` does, for all files in a folder.
+
+    Args:
+        folder (path): the folder.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._whole_files import remove_leftovers_in
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     remove_leftovers_in(folder)
+    """
+    _remove_leftovers(Path(folder), ".+?")
+
+
+def _remove_leftovers(folder: Path, name: str) -> None:
+    if not folder.is_dir():
+        return
+    owner = rf"{_machine()}-(?P<pid>\d+)\.\d+"
+    pattern = rf"\.?{re.escape(_PARTIAL)}{owner}-(?P<name>{name})(\.\w+-\w+)*"
+    for left in folder.iterdir():
+        match = re.fullmatch(pattern, left.name)
+        if match is None or left in _in_use or _is_running(int(match["pid"])):
+            continue
+        with contextlib.suppress(OSError):  # a read-only folder, or another was faster
+            target, old = folder / match["name"], left / f"{_REPLACED}{match['name']}"
+            if old.exists() and not target.exists():
+                os.replace(old, target)  # killed between the two moves
+            if left.is_dir():
+                shutil.rmtree(left)
+            else:
+                left.unlink()
+
+
+def _is_running(pid: int) -> bool:
+    if pid == os.getpid():
+        return False  # an earlier process with the same number: ours is not in use
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it belongs to another user
+        return True
+    return True
+
+
+def _machine() -> str:
+    # Numbers of processes are known on their own machine only.
+    return f"{zlib.crc32(platform.node().encode()):08x}"
