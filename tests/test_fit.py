@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Unbounded
 
 import torchrl_caiac.fit as module
+from tests.killing import run_killed
+from torchrl_caiac._files import whole_file
 from torchrl_caiac.data.write_transitions import write_transitions
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.fit import fit_world_model
@@ -164,9 +167,16 @@ def test_interrupted_and_resumed_ends_with_the_same_bytes(
     with pytest.raises(KeyboardInterrupt):
         fit(interrupted, data, **options)
     assert [p.name for p in path.parent.iterdir()] == ["fit.ckpt"]
-    # What an interrupted write leaves is removed by the next call.
-    (path.parent / ".partial-12-fit.ckpt").write_text("half")
-    (path.parent / "..partial-12-fit.ckpt.stage-1f").mkdir()
+
+    # What a killed write leaves is removed by the next call.
+    def half() -> Iterator[None]:
+        with whole_file(path) as partial:
+            partial.write_text("half")
+            (path.parent / f".{partial.name}.stage-1f").mkdir()
+            yield
+
+    run_killed(half)
+    assert len(list(path.parent.iterdir())) == 3
     torch.manual_seed(99)
     resumed = GaussianWorldModel(LAYOUT, 2, (32, 32), **kwargs)
     history = fit(resumed, data, **options)

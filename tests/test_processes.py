@@ -67,6 +67,10 @@ def uses(tool, number):
     return number, os.getpid(), tool.used
 
 
+def makes_a_function():
+    return lambda: 1
+
+
 def dies():
     os._exit(7)
 
@@ -190,6 +194,35 @@ class TestRunInProcesses:
         with pytest.raises(RuntimeError, match="TwoArguments: sand: wet") as caught:
             next(runs)
         assert "in fails" in "".join(traceback.format_exception(caught.value))
+
+    @pytest.mark.parametrize("processes", [0, 1])
+    def test_a_job_that_exits_ends_nothing_but_itself(self, jobs, processes):
+        calls = [(sorted, "ba"), (sys.exit, 3)]
+        runs = run_in_processes(jobs.calls, calls, processes=processes)
+        assert next(runs) == (0, ["a", "b"])
+        with pytest.raises(RuntimeError, match=r"job 1 called sys\.exit\(3\)"):
+            next(runs)
+        setup = partial(sys.exit, "no licence")
+        with pytest.raises(
+            RuntimeError, match=r"setup called sys\.exit\('no licence'\)"
+        ):
+            list(run_in_processes(jobs.uses, [(0,)], processes=processes, setup=setup))
+
+    def test_what_cannot_be_pickled_names_the_job(self, jobs):
+        calls = [(sorted, "ba"), (jobs.makes_a_function,)]
+        runs = run_in_processes(jobs.calls, calls, processes=1)
+        assert next(runs) == (0, ["a", "b"])
+        with pytest.raises(
+            RuntimeError, match=r"job 1 returned a function that cannot"
+        ):
+            next(runs)
+        calls[1] = (lambda: 1,)
+        with pytest.raises(TypeError, match=r"job 1 cannot be sent to a process"):
+            list(run_in_processes(jobs.calls, calls, processes=1))
+
+    def test_tensors_come_back(self, jobs):
+        values = dict(run_in_processes(jobs.calls, [(torch.arange, 5)], processes=1))
+        assert values[0].tolist() == [0, 1, 2, 3, 4]
 
     @pytest.mark.parametrize("processes", [0, 1])
     def test_errors_of_set_up_are_raised(self, jobs, tmp_path, processes):

@@ -16,6 +16,7 @@ LAYERS = [
         "_buffer_transform",
         "_columns",
         "_files",
+        "_fingerprints",
         "_keys",
         "_processes",
         "_random",

@@ -11,6 +11,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import islice
+from multiprocessing.reduction import ForkingPickler
 from multiprocessing.util import Finalize
 from typing import Any
 
@@ -93,7 +94,9 @@ def run_in_processes(
     Raises:
         ValueError: ``processes`` is negative.
         RuntimeError: a process ended in the middle of a job, for example for lack of
-            memory; or an error that cannot be pickled, described with its traceback.
+            memory; a job called ``sys.exit``, or returned what cannot be pickled; or an
+            error that cannot be pickled, described with its traceback.
+        TypeError: the arguments of a job cannot be pickled.
         Exception: whatever a job or ``setup`` raised.
 
     Examples:
@@ -123,13 +126,16 @@ def run_in_processes(
         # queued for the next free process.
         with _one_thread_in_new_processes():
             for number, job in islice(waiting, count):
-                running[pool.submit(_run_job, function, job)] = number
+                packed = _pack(function, job, number)
+                running[pool.submit(_run_packed, number, packed)] = number
 
     try:
         start(processes)
         while running:
             done, _ = wait(running, return_when=FIRST_COMPLETED)
-            finished = [(running.pop(future), future.result()) for future in done]
+            finished = [
+                (running.pop(future), pickle.loads(future.result())) for future in done
+            ]
             start(len(finished))
             yield from sorted(finished)
     except BrokenProcessPool as error:
@@ -150,8 +156,11 @@ def _run_here(
     try:
         for number, job in enumerate(jobs):
             if setup is not None and not made:
-                made = (setup(),)
-            yield number, function(*made, *job)
+                with _no_exit("setup"):
+                    made = (setup(),)
+            with _no_exit(f"job {number}"):
+                result = function(*made, *job)
+            yield number, result
     finally:
         for value in made:
             _close(value)
@@ -169,6 +178,42 @@ def _one_thread_in_new_processes() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def _pack(function: Callable[..., Any], job: tuple[Any, ...], number: int) -> bytes:
+    # By ourselves: the pool's error would not name the job.
+    try:
+        return bytes(ForkingPickler.dumps((function, job)))
+    except Exception as error:  # __reduce__ of any class may raise anything
+        raise TypeError(
+            f"job {number} cannot be sent to a process, its function or arguments "
+            f"cannot be pickled ({error})"
+        ) from error
+
+
+@contextmanager
+def _no_exit(what: str) -> Iterator[None]:
+    """Raises an error where a job asks to exit, which would end the whole program."""
+    try:
+        yield
+    except SystemExit as error:
+        raise RuntimeError(
+            f"{what} called sys.exit({error.code!r}): raise an error instead"
+        ) from error
+
+
+def _run_packed(number: int, packed: bytes) -> bytes:
+    """Runs one job in a process; arguments and result are our own pickles."""
+    function, job = pickle.loads(packed)
+    with _no_exit(f"job {number}"):
+        result = _run_job(function, job)
+    try:
+        return bytes(ForkingPickler.dumps(result))
+    except Exception as error:  # __reduce__ of any class may raise anything
+        raise RuntimeError(
+            f"job {number} returned a {type(result).__name__} that cannot be pickled "
+            f"({error}): return other values, or write them to a file"
+        ) from error
 
 
 def _run_job(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
@@ -203,7 +248,8 @@ def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:
     if setup is None:
         return
     try:
-        made = setup()
+        with _no_exit("setup"):
+            made = setup()
     except Exception as error:  # raised here, it would break the pool without a reason
         _setup_error = error
         return

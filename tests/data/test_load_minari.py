@@ -363,8 +363,8 @@ class TestTextAndObjects:
 
     def test_an_unknown_entry_is_named(self, tmp_path):
         dataset, _ = make_dataset(flat)
-        with pytest.raises(KeyError, match=r"no \[\('misson',\)\].*'observation'"):
-            load_minari(dataset, tmp_path / "x", exclude=["misson"], progress=False)
+        with pytest.raises(KeyError, match=r"no \[\('errand',\)\].*'observation'"):
+            load_minari(dataset, tmp_path / "x", exclude=["errand"], progress=False)
 
 
 class TestActionBounds:

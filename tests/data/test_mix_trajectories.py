@@ -286,11 +286,15 @@ def test_bad_sources():
         mix_trajectories([good, good], trajectory_key="traj")
     with pytest.raises(ValueError, match=r"source 0: 'action' has shape \[5, 2\]"):
         mix_trajectories([good], trajectory_key="action")
-    with pytest.raises(ValueError, match="7 of source 1 are not consecutive"):
-        mix_trajectories([good, torch.cat([good, good[:2]])])
     named = source([2]).set("name", NonTensorData("expert", [2]))
     with pytest.raises(ValueError, match=r"'name' of source 0 is a NonTensorData"):
         mix_trajectories([named])
+
+
+def test_rows_of_parallel_environments_become_consecutive():
+    whole = source([4, 3])
+    order = torch.tensor([0, 4, 1, 5, 2, 6, 3])
+    assert_whole(mix_trajectories([whole[order]]), [whole])
 
 
 class TestFolders:

@@ -142,7 +142,13 @@ def test_integers_and_flags_are_fitted_as_the_numbers_that_they_are(
             fitted.load_state_dict(model.state_dict())
             for memory in (2**30, 0):  # in one block, and batch by batch
                 fit_world_model(
-                    fitted, td, steps=2, batch_size=8, max_memory=memory, progress=False
+                    fitted,
+                    td,
+                    steps=2,
+                    batch_size=8,
+                    max_memory=memory,
+                    check=False,
+                    progress=False,
                 )
                 models.append(fitted)
         own, reference = models[:3], models[3:]

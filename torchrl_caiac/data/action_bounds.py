@@ -25,7 +25,7 @@ def action_bounds(
 
     :func:`~torchrl_caiac.data.load_minari`,
     :func:`~torchrl_caiac.data.mix_trajectories` and
-    :func:`~torchrl_caiac.data.write_transitions.write_transitions` store them in
+    :func:`~torchrl_caiac.data.write_transitions` store them in
     ``action_space.json``.
 
     Args:
@@ -45,8 +45,7 @@ def action_bounds(
         >>> import tempfile
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_caiac.data import action_bounds
-        >>> from torchrl_caiac.data.write_transitions import write_transitions
+        >>> from torchrl_caiac.data import action_bounds, write_transitions
         >>> data = TensorDict(
         ...     {
         ...         "action": torch.zeros(3, 2),

@@ -125,7 +125,7 @@ def write_digests(
         >>> import tempfile
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_caiac.data.digests import verify_digests, write_digests
+        >>> from torchrl_caiac.data import verify_digests, write_digests
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = TensorDict({"action": torch.zeros(3, 2)}, [3]).memmap(folder)
         ...     write_digests(folder)
@@ -177,7 +177,7 @@ def verify_digests(folder: str | os.PathLike[str]) -> None:
         >>> import tempfile
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_caiac.data.digests import verify_digests, write_digests
+        >>> from torchrl_caiac.data import verify_digests, write_digests
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     rows = TensorDict({"action": torch.zeros(3, 2)}, [3]).memmap(folder)
         ...     write_digests(folder)

@@ -46,7 +46,7 @@ def load_transitions(
             ``"action"``, ``"episode"`` and ``("next", "done")``.
         verify (bool): whether to compare the content of all leaves with the digests
             that were written with them, see
-            :func:`~torchrl_caiac.data.digests.verify_digests`. This reads all files.
+            :func:`~torchrl_caiac.data.verify_digests`. This reads all files.
             Defaults to ``False``: only sizes are checked.
 
     Returns:

@@ -81,6 +81,9 @@ def write_transitions(
 ) -> TensorDict:
     """Writes transitions to a folder, atomically, and opens it.
 
+    The digests of all leaves are written too, see
+    :func:`~torchrl_caiac.data.verify_digests`.
+
     Args:
         data (TensorDictBase): the transitions, ``[T]``.
         path (path): the folder.
@@ -106,7 +109,7 @@ def write_transitions(
         >>> import tempfile
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_caiac.data.write_transitions import write_transitions
+        >>> from torchrl_caiac.data import write_transitions
         >>> data = TensorDict(
         ...     {
         ...         "action": torch.zeros(3, 2),
