@@ -59,7 +59,11 @@ def every_draw(scores, truth, transform, batches=60):
         choice = torch.randint(len(scores), (32,), generator=generator)
         draw = transform.generate_parameters(scores[choice], generator)
         offset = 32 - len(draw.swapped)
+        chosen = torch.ones(len(draw.swapped)) if draw.chosen is None else draw.chosen
         for i, row in enumerate(draw.swapped.tolist()):
+            if not chosen[i]:
+                assert not any(row)
+                continue
             swapped_rows.append(any(row))
             for j, swapped in enumerate(row):
                 if swapped:

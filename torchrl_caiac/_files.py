@@ -6,10 +6,11 @@ import errno
 import json
 import logging
 import os
+import platform
 import shutil
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -374,11 +375,11 @@ def claim_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
     The lock ends with the block or with the process.
 
     Args:
-        folder (path): the folder, in which the file ``.lock`` is created. A missing
-            folder is created.
+        folder (path): the folder, in which the files ``.lock`` and ``.lock-owner`` are
+            created. A missing folder is created.
 
     Raises:
-        RuntimeError: another process has locked the folder.
+        RuntimeError: another process has locked the folder; the message names it.
 
     Examples:
         >>> import tempfile
@@ -388,15 +389,19 @@ def claim_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock")
+    lock, owner = FileLock(folder / ".lock"), folder / ".lock-owner"
     try:
         lock.acquire(timeout=0)
     except Timeout:
+        name = "another process"
+        with suppress(OSError):  # it may not have written its name yet
+            name = owner.read_text(encoding="utf-8") or name
         raise RuntimeError(
-            f"another process is using {folder}: wait for it, stop it, or give another "
-            "folder"
+            f"{name} is using {folder}: wait for it, stop it, or give another folder"
         ) from None
     try:
+        owner.write_text(f"process {os.getpid()} on {platform.node()}", "utf-8")
         yield
     finally:
+        owner.unlink(missing_ok=True)
         lock.release()

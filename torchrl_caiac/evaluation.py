@@ -144,7 +144,7 @@ def swap_shares(
         own = truth[batch_size - len(draw.swapped) :]
         donors = truth.gather(0, draw.donors.where(draw.swapped, 0))
         rows += int(draw.swapped.any(-1).sum())
-        total += len(draw.swapped)
+        total += len(own) if draw.chosen is None else int(draw.chosen.sum())
         swaps += draw.swapped.sum(0)
         infeasible += (draw.swapped & (own | donors)).sum(0)
     return SwapShares(
@@ -224,6 +224,7 @@ def compare_influence(
             smoothing=candidate.smoothing,
             lookahead=0,
             key="score",
+            check=False,  # of the next states nothing is read
             progress=progress,
         )
         seconds = _cpu_seconds() - begin

@@ -263,7 +263,7 @@ def remove_rows(data: TensorDict) -> TensorDict:
 
 def merge_ids(data: TensorDict) -> None:
     data["episode"] //= 2
-    del data["next", "done"]
+    data.exclude(DONE, ("next", "terminated"), ("next", "truncated"), inplace=True)
 
 
 def merge_ids_with_time(data: TensorDict) -> None:

@@ -53,7 +53,7 @@ def test_rejects_scores_that_are_not_finite(value):
     rows["observation"][9, 1] = 77.0
     rb = filled(rows)
     with pytest.raises(ValueError, match=r"\['cup'\] in the state of the rows \[9\]"):
-        score_buffer(rb, Bad(), 4, progress=False)
+        score_buffer(rb, Bad(), 4, check=False, progress=False)
     assert not scores(rb)[:4].isnan().any()  # a finished chunk
     assert scores(rb)[4:].isnan().all()
 
@@ -62,11 +62,11 @@ def test_rejects_observations_that_are_not_finite():
     rows = episodes([5, 7])
     rows["observation"][3, 0] = torch.nan
     with pytest.raises(ValueError, match=r"'observation'.*the state of the rows \[3\]"):
-        score_buffer(filled(rows), Read(), progress=False)
+        score_buffer(filled(rows), Read(), check=False, progress=False)
     rows = episodes([5, 7])
     rows["next", "observation"][11, 0] = torch.inf
     with pytest.raises(ValueError, match=r"the next state of the rows \[11\]"):
-        score_buffer(filled(rows), Read(), progress=False)
+        score_buffer(filled(rows), Read(), check=False, progress=False)
 
 
 class Prepared(Read):
@@ -129,7 +129,7 @@ def test_rows_that_are_not_finite_are_named_in_the_fast_mode():
     model = ready(GaussianWorldModel(layout, 2, (8,)))
     fast = CAI(model, mode="fast", threshold=1e-4)
     with pytest.raises(ValueError, match=r"state of the rows \[33\]"):
-        score_buffer(filled(rows), fast, progress=False)
+        score_buffer(filled(rows), fast, check=False, progress=False)
 
 
 def model_cai(**kwargs):

@@ -23,6 +23,7 @@ from torchrl_caiac._torchrl import (
     storage_data,
     storage_rows,
 )
+from torchrl_caiac.check import check_before_use
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import (
     ScoreLeaves,
@@ -64,6 +65,7 @@ def score_buffer(
     trajectory_key: NestedKey | None = "episode",
     done_key: NestedKey | None = ("next", "done"),
     overwrite: bool = False,
+    check: bool = True,
     progress: bool = True,
 ) -> None:
     r"""Computes the influence scores of all stored states and adds them to the storage.
@@ -150,6 +152,8 @@ def score_buffer(
             ``trajectory_key`` alone. Defaults to ``("next", "done")``.
         overwrite (bool): recompute all scores, whatever the leaf contains. Defaults to
             ``False``.
+        check (bool): check a sample of the data first, see
+            :func:`~torchrl_caiac.check_dataset`. Defaults to ``True``.
         progress (bool): show a progress bar. Defaults to ``True``.
 
     Raises:
@@ -160,6 +164,7 @@ def score_buffer(
             origin, or the scores have other settings; ``every`` is above 1 and old rows
             were overwritten; ``lookahead`` is below the steps to the next states.
         RuntimeError: another process is scoring the folder.
+        DatasetError: the check found errors.
         KeyError: the storage lacks a key.
 
     Examples:
@@ -201,6 +206,16 @@ def score_buffer(
     key, storage = as_key(key), rb.storage
     known_to_be_memmap(storage_data(storage))
     layout = layout_of(estimator)
+    if check:
+        check_before_use(
+            rb,
+            layout,
+            action_key=None,
+            reward_key=None,
+            trajectory_key=trajectory_key,
+            done_key=done_key,
+            read_next=smoothing > 1 or lookahead > 0,
+        )
     settings = score_settings(
         estimator,
         layout,

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 
-from torchrl_caiac._files import write_json
+from torchrl_caiac._files import reserve, safe_meta, write_json
 from torchrl_caiac._fingerprints import (
     fingerprint_key,
     is_fingerprint_of,
@@ -199,7 +199,7 @@ def _new_leaf(
         leaf = None
     if leaf is None:
         if data.is_memmap():
-            leaf = data.make_memmap(key, shape=shape, dtype=dtype)
+            leaf = _new_file(data, key, shape, dtype)
         else:
             if data.is_locked and data.is_shared():
                 raise ValueError(
@@ -212,6 +212,26 @@ def _new_leaf(
                 data.set(key, leaf)
             leaf = data.get(key)
     return leaf.as_subclass(torch.Tensor)
+
+
+def _new_file(
+    data: TensorDictBase, key: NestedKey, shape: torch.Size, dtype: torch.dtype
+) -> torch.Tensor:
+    """Adds a leaf to memory-mapped data, whose folder stays readable if it is killed.
+
+    Raises:
+        OSError: the disk is full; the leaf is removed.
+    """
+    folder = memmap_folder(data)
+    with contextlib.nullcontext() if folder is None else safe_meta(folder):
+        leaf = data.make_memmap(key, shape=shape, dtype=dtype)
+        if folder is not None:
+            try:
+                reserve(leaf.filename)
+            except OSError:
+                _remove_leaf(data, key)
+                raise
+    return leaf
 
 
 def _remove_leaf(data: TensorDictBase, key: NestedKey) -> None:
