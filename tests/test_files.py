@@ -50,7 +50,9 @@ def test_a_folder_is_claimed_once(tmp_path):
     for _ in range(2):
         with claim_folder(folder):
             with (
-                pytest.raises(RuntimeError, match=r"another process is using.*folder"),
+                pytest.raises(
+                    RuntimeError, match=rf"process {os.getpid()} on .*is using.*folder"
+                ),
                 claim_folder(folder),
             ):
                 pass

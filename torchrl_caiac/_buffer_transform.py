@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any, NoReturn
 
+import torch
 from torchrl.envs.transforms import Transform
 
-__all__ = ["BufferTransform"]
+__all__ = ["BufferTransform", "RandomTransform"]
 
 
 class BufferTransform(Transform):
@@ -43,3 +44,47 @@ class BufferTransform(Transform):
 
     def _reset(self, tensordict: Any, tensordict_reset: Any) -> NoReturn:
         self._refuse()
+
+
+class RandomTransform(BufferTransform):
+    """A transform of a replay buffer that draws random numbers.
+
+    The state of its generator is part of ``state_dict``, and so of the saved buffer, as
+    that of the buffer's own generator is.
+
+    Args:
+        generator (torch.Generator, optional): source of randomness; ``None`` for
+            torch's default one.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac._buffer_transform import RandomTransform
+        >>> transform = RandomTransform(torch.Generator().manual_seed(0))
+        >>> state = transform.state_dict()
+        >>> before = torch.rand(2, generator=transform.generator)
+        >>> _ = transform.load_state_dict(state)
+        >>> torch.equal(before, torch.rand(2, generator=transform.generator))
+        True
+    """
+
+    def __init__(self, generator: torch.Generator | None) -> None:
+        super().__init__()
+        self.generator = generator
+
+    def set_generator(self, generator: torch.Generator | None) -> None:
+        """Sets the source of randomness.
+
+        Args:
+            generator (torch.Generator, optional): ``None`` for torch's default one.
+        """
+        self.generator = generator
+
+    def get_extra_state(self) -> dict[str, torch.Tensor]:
+        """Returns the state of the generator, for ``state_dict``."""
+        generator = self.generator
+        return {} if generator is None else {"generator": generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, torch.Tensor]) -> None:
+        """Restores what :meth:`get_extra_state` returned."""
+        if self.generator is not None and "generator" in state:
+            self.generator.set_state(state["generator"].cpu())

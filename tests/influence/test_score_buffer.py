@@ -419,7 +419,9 @@ def test_rejects_bad_arguments():
     with pytest.raises(ValueError, match="needs at least 10"):
         score_buffer(rb, Read(layout=wide), check=False)
     with pytest.raises(KeyError, match=r"the layout reads .*next"):
-        score_buffer(filled(episodes([5]).exclude(("next", "observation"))), Read())
+        score_buffer(
+            filled(episodes([5]).exclude(("next", "observation"))), Read(), check=False
+        )
 
 
 def test_the_progress_bar_counts_rows(capsys):

@@ -206,16 +206,6 @@ def score_buffer(
     key, storage = as_key(key), rb.storage
     known_to_be_memmap(storage_data(storage))
     layout = layout_of(estimator)
-    if check:
-        check_before_use(
-            rb,
-            layout,
-            action_key=None,
-            reward_key=None,
-            trajectory_key=trajectory_key,
-            done_key=done_key,
-            read_next=smoothing > 1 or lookahead > 0,
-        )
     settings = score_settings(
         estimator,
         layout,
@@ -228,6 +218,16 @@ def score_buffer(
     is_prepared = False
     for number in range(_MOST_PASSES):
         index = trajectory_index(rb, trajectory_key=trajectory_key, done_key=done_key)
+        if check and not number:
+            check_before_use(
+                rb,
+                layout,
+                action_key=None,
+                reward_key=None,
+                trajectory_key=trajectory_key,
+                done_key=done_key,
+                read_next=smoothing > 1 or lookahead > 0,
+            )
         if every > 1 and index.oldest:
             raise ValueError(
                 f"every is {every}, but the oldest rows of the buffer were "

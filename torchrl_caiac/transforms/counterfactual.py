@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import HERReplayBuffer, ReplayBuffer, TensorStorage
 
-from torchrl_caiac._buffer_transform import BufferTransform
+from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import sampling_buffer
@@ -42,7 +42,7 @@ __all__ = ["CounterfactualTransform"]
 _Transform = TypeVar("_Transform", bound="CounterfactualTransform")
 
 
-class CounterfactualTransform(BufferTransform, ABC):
+class CounterfactualTransform(RandomTransform, ABC):
     """Makes rows of a batch counterfactual, by their scores.
 
     A subclass defines what may be swapped (:meth:`swappable`) and how donors are drawn
@@ -97,7 +97,7 @@ class CounterfactualTransform(BufferTransform, ABC):
         keys: TransformKeys | None,
         check: bool,
     ) -> None:
-        super().__init__()
+        super().__init__(check_generator(generator))
         self.layout = check_layout(layout)
         self.threshold = check_number("threshold", threshold, math.inf)
         self.counterfactual_ratio = check_number(
@@ -112,7 +112,6 @@ class CounterfactualTransform(BufferTransform, ABC):
         self.swap_prob = check_number("swap_prob", swap_prob, 1.0)
         self.window = check_window(window)
         self.score_key = as_key(score_key)
-        self.generator = check_generator(generator)
         self.keys = keys or TransformKeys()
         self.check = bool(check)
         self._goal_leaves = GoalLeaves(
@@ -229,14 +228,6 @@ class CounterfactualTransform(BufferTransform, ABC):
         """The number of sampled rows without valid scores, with ``unscored="keep"``."""
         return int(self._unscored)
 
-    def set_generator(self, generator: torch.Generator | None) -> None:
-        """Sets the source of randomness.
-
-        Args:
-            generator (torch.Generator, optional): ``None`` for torch's default one.
-        """
-        self.generator = generator
-
     def refresh_donors(self) -> None:
         """Drops the index of eligible donors, so that it is built again.
 
@@ -251,16 +242,6 @@ class CounterfactualTransform(BufferTransform, ABC):
         self._no_donor.share_memory_()
         self._unscored.share_memory_()
         return self
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Returns the state of the generator, for ``state_dict``."""
-        generator = self.generator
-        return {} if generator is None else {"generator": generator.get_state()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`get_extra_state` returned."""
-        if self.generator is not None and "generator" in state:
-            self.generator.set_state(state["generator"].cpu())
 
     # --- the two halves of an augmentation -------------------------------------------
 

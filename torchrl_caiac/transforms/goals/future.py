@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers import SampleUnit
 
-from torchrl_caiac._buffer_transform import BufferTransform
+from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_integers, draw_numbers
 from torchrl_caiac._torchrl import storage_rows
@@ -102,7 +102,7 @@ def _geometric(
     return draw_numbers(draw, device=device, generator=generator)
 
 
-class FutureGoal(BufferTransform, SampleUnit):
+class FutureGoal(RandomTransform, SampleUnit):
     """Draws goals from a storage in ``expand``, for ``forward`` to write.
 
     The base of :class:`~torchrl_caiac.transforms.WindowGoal` and
@@ -130,7 +130,7 @@ class FutureGoal(BufferTransform, SampleUnit):
         generator: torch.Generator | None,
         keys: TransformKeys | None,
     ) -> None:
-        super().__init__()
+        super().__init__(check_generator(generator))
         check_layout(layout)
         if not 0 < p <= 1:
             raise ValueError(
@@ -154,7 +154,6 @@ class FutureGoal(BufferTransform, SampleUnit):
                 )
         self.layout = layout
         self.p = float(p)
-        self.generator = check_generator(generator)
         self.keys = keys or TransformKeys()
         if layout.is_flat and layout.achieved:
             key: NestedKey = layout.next(layout.observation_key)
@@ -199,14 +198,6 @@ class FutureGoal(BufferTransform, SampleUnit):
         data = storage_rows(storage, "the buffer")
         assert isinstance(storage, TensorStorage)  # else storage_rows raised
         return data, self._cache.get(storage)
-
-    def set_generator(self, generator: torch.Generator | None) -> None:
-        """Sets the source of randomness.
-
-        Args:
-            generator (torch.Generator, optional): ``None`` for torch's default one.
-        """
-        self.generator = generator
 
     # --- reading ---------------------------------------------------------------------
 

@@ -354,7 +354,7 @@ class HindsightGoal(FutureGoal):
         """Relabels a batch.
 
         Args:
-            tensordict (TensorDictBase): the batch ``[B]``.
+            tensordict (TensorDictBase): the batch ``[*B]``.
 
         Returns:
             TensorDictBase: a shallow copy with new leaves; the input is not changed.
@@ -366,11 +366,9 @@ class HindsightGoal(FutureGoal):
             ValueError: goals or rewards have the wrong shape.
         """
         goals = self._pending.__dict__.pop("goals", None)
-        if tensordict.ndim != 1:
-            raise ValueError(
-                f"the batch has shape {list(tensordict.shape)}, expected [B]: sample "
-                "flat batches of transitions"
-            )
+        shape = tensordict.batch_size
+        if len(shape) != 1:
+            tensordict = tensordict.reshape(-1)
         rows = tensordict.shape[0]
         if self.future > 0:
             if goals is None:
@@ -402,7 +400,8 @@ class HindsightGoal(FutureGoal):
             device = stored_reward(tensordict, self.keys.reward).device
             flags = torch.zeros(rows, 1, dtype=torch.bool, device=device)
         draw = self.generate_parameters(flags, goals)
-        return self.apply_parameters(tensordict, draw)
+        out = self.apply_parameters(tensordict, draw)
+        return out if len(shape) == 1 else out.reshape(shape)
 
     def her_reward(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Computes the rewards for a :class:`~torchrl.data.HERReplayBuffer`.
@@ -412,9 +411,9 @@ class HindsightGoal(FutureGoal):
         ``her_ratio`` at most ``1 - counterfactual_ratio`` these are real rows, and a
         ``HindsightGoal`` with ``future=0`` relabels the counterfactual ones after them.
         The flag ``keys.relabeled`` is set for both, and so are end flags if there is a
-        ``terminated_fn``. That buffer identifies
-        trajectories by their end flags only, and in TorchRL 0.14 it must not be written
-        to once it is full.
+        ``terminated_fn``. Append the augmentation with ``rows="last"``. That buffer
+        identifies trajectories by their end flags only, and in TorchRL 0.14 it must not
+        be written to once it is full.
 
         Args:
             tensordict (TensorDictBase): the rows that the buffer relabelled.
@@ -449,7 +448,7 @@ class HindsightGoal(FutureGoal):
             ...     "next": {"observation": state, "achieved_goal": state,
             ...         "reward": -torch.ones(20, 1), "done": end},
             ...     ("caiac", "score"): torch.zeros(20, 2)}, [20]))
-            >>> _ = rb.append_transform(CAIACTransform(layout))
+            >>> _ = rb.append_transform(CAIACTransform(layout, rows="last"))
             >>> _ = rb.append_transform(goals)
             >>> rb.sample()["hindsight", "relabeled"][:4].flatten()
             tensor([ True,  True, False, False])
