@@ -5,7 +5,6 @@ Run after ``train.py``: ``python evaluate.py method=caiac seed=0``.
 
 from __future__ import annotations
 
-import json
 import logging
 from typing import Any
 
@@ -16,7 +15,7 @@ from environments.base import Evaluation
 from shared.console import progress_bar, start
 from shared.parts import make_environment, policy_file, policy_steps, run_folder
 from shared.settings import keep_settings
-from torchrl_caiac._files import write_json
+from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.data.digests import file_digest
 from train import check_run, load_policy
 
@@ -34,6 +33,7 @@ def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
     kept: dict[str, Any] = OmegaConf.to_container(cfg.env.evaluate)
     for name in ("last", "curve_every"):  # which policies, not what they do
         kept.pop(name)
+    kept["collect"] = OmegaConf.to_container(cfg.env.collect)  # has lengths of episodes
     keep_settings(folder, "evaluate", kept)
     check_run(cfg, method, seed)
     evaluations = []
@@ -52,7 +52,8 @@ def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
                 actor = load_policy(cfg, method, seed, step)
                 write_json(path, environment.play(actor, seed, folder))
             fraction = float(cfg.env.get("fraction", 1.0))
-            episodes = json.loads(path.read_text())
+            remedy = "delete it, to play the episodes again"
+            episodes = read_json(path, "evaluation", remedy)
             evaluations.append(Evaluation(method, seed, step, fraction, episodes))
             bar.update()
     success = [episode[environment.success_key] for episode in evaluations[-1].episodes]

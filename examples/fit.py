@@ -7,7 +7,6 @@ interrupted fit resumes at its last checkpoint.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -21,7 +20,7 @@ from environments.base import Environment
 from shared.console import progress, start
 from shared.parts import make_environment, make_methods
 from shared.settings import keep_settings
-from torchrl_caiac._files import write_json
+from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.data.digests import content_digests
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
@@ -116,7 +115,9 @@ def fit_model(cfg: DictConfig, name: str) -> Any:
 def fit_seconds(cfg: DictConfig, name: str) -> float:
     """Returns the processor time of a fit; NaN if it was interrupted."""
     path = make_environment(cfg).folder / f"{name}_fit.json"
-    return json.loads(path.read_text())["seconds"] if path.exists() else math.nan
+    if not path.exists():
+        return math.nan
+    return read_json(path, "time of a fit", "delete it")["seconds"]
 
 
 def fit(cfg: DictConfig) -> None:

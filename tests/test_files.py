@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
+from tests.killing import run_killed, running
 from torchrl_caiac._files import (
     UnreadableFileError,
     claim_folder,
@@ -20,6 +22,7 @@ from torchrl_caiac._files import (
     safe_meta,
     write_json,
 )
+from torchrl_caiac._torchrl import mark_memmap
 
 
 class TestWriteJson:
@@ -121,19 +124,60 @@ class TestSafeMeta:
         loaded = TensorDict.load_memmap(tmp_path)
         assert ("next", "y") in loaded.keys(True)
 
-    @pytest.mark.parametrize("emptied", ["meta.json", "next/meta.json"])
-    @pytest.mark.parametrize("key", ["y", ("next", "y"), ("new", "y")])
+    @pytest.mark.parametrize(
+        ("key", "emptied"),
+        [
+            *product(["y", ("next", "y"), ("new", "y")], ["meta.json"]),
+            *product(["y", ("next", "y"), ("new", "y")], ["next/meta.json"]),
+            (("new", "y"), "new/meta.json"),
+        ],
+    )
     def test_a_killed_addition_is_undone(self, tmp_path, key, emptied):
-        rows = stored(tmp_path)
+        stored(tmp_path)
         kept = {f: f.read_bytes() for f in tmp_path.rglob("meta.json")}
-        guard = safe_meta(tmp_path)
-        guard.__enter__()  # and never leaves, as in a killed process
-        rows.make_memmap(key, shape=torch.Size([3]))
-        (tmp_path / emptied).write_text("")
+        run_killed(half_an_addition, tmp_path, key, emptied)
+        assert len(list(tmp_path.rglob("*.bak"))) == 2
         assert recover_meta(tmp_path)
         assert {f: f.read_bytes() for f in kept} == kept
         assert set(TensorDict.load_memmap(tmp_path).keys()) == {"action", "next"}
         assert not recover_meta(tmp_path)
+        rows = TensorDict.load_memmap(tmp_path)
+        mark_memmap(rows)
+        with safe_meta(tmp_path):
+            rows.make_memmap(key, shape=torch.Size([3]))
+        assert key in TensorDict.load_memmap(tmp_path).keys(True)
+        assert not list(tmp_path.rglob("*.bak"))
+
+    def test_what_a_running_process_writes_is_not_undone(self, tmp_path, monkeypatch):
+        stored(tmp_path)
+        monkeypatch.setattr("torchrl_caiac._files._SECONDS_BETWEEN_TRIES", 0.0)
+        with running(half_an_addition, tmp_path, "y", "meta.json"):
+            assert not recover_meta(tmp_path)
+            assert (tmp_path / "meta.json").read_text() == ""
+        monkeypatch.setattr("platform.node", lambda: "elsewhere")
+        assert not recover_meta(tmp_path)
+        for copy in tmp_path.rglob("*.bak"):
+            os.utime(copy, (0, 0))
+        assert recover_meta(tmp_path)
+
+    def test_copies_of_a_finished_addition_are_not_used(self, tmp_path):
+        stored(tmp_path)
+        run_killed(half_an_addition, tmp_path, "y", None)
+        assert not recover_meta(tmp_path)
+        assert "y" in TensorDict.load_memmap(tmp_path)
+        run_killed(half_an_addition, tmp_path, "z", "meta.json")
+        assert recover_meta(tmp_path)
+        assert set(TensorDict.load_memmap(tmp_path).keys()) == {"action", "next", "y"}
+
+    def test_blocks_may_be_nested(self, tmp_path):
+        stored(tmp_path)
+        kept = (tmp_path / "meta.json").read_text()
+        with pytest.raises(OSError, match="full"), safe_meta(tmp_path):
+            with safe_meta(tmp_path):
+                pass
+            (tmp_path / "meta.json").write_text("")
+            raise OSError("full")
+        assert (tmp_path / "meta.json").read_text() == kept
 
     def test_an_error_restores_at_once(self, tmp_path):
         stored(tmp_path)
@@ -154,3 +198,13 @@ class TestSafeMeta:
         ):
             pass
         assert not list(tmp_path.rglob("*.bak"))
+
+
+def half_an_addition(folder: Path, key, emptied: str | None):
+    rows = TensorDict.load_memmap(folder)
+    mark_memmap(rows)
+    with safe_meta(folder):
+        rows.make_memmap(key, shape=torch.Size([3]))
+        if emptied is not None:
+            (folder / emptied).write_text("")
+        yield

@@ -8,6 +8,7 @@ import logging
 import os
 import platform
 import shutil
+import time
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,8 +18,10 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from torchrl_caiac._whole_files import (
+    has_ended,
     remove_leftovers,
     remove_leftovers_in,
+    this_process,
     whole_file,
     whole_folder,
 )
@@ -43,7 +46,10 @@ _logger = logging.getLogger("torchrl_caiac")
 
 _MOST_JSON = 64 << 20  # bytes; settings, layouts and records are far smaller
 _META = "meta.json"  # tensordict's, one in every folder of a memory-mapped tensordict
-_META_COPY = "meta.json.bak"
+_COPIES = "meta.json.*-*.bak"  # named after the process that has made them
+_SECONDS_TO_ADD_A_LEAF = 600.0
+_TRIES, _SECONDS_BETWEEN_TRIES = 20, 0.05
+_guarded: set[Path] = set()  # the folders to which this process is adding a leaf
 
 
 class UnreadableFileError(ValueError):
@@ -164,30 +170,41 @@ def safe_meta(folder: str | os.PathLike[str]) -> Iterator[None]:
         ...     sorted(os.listdir(folder))
         ['action.memmap', 'caiac', 'meta.json']
     """
-    recover_meta(folder)
-    files = _meta_files(folder)
+    root = Path(folder).resolve()
+    if root in _guarded:
+        yield
+        return
+    recover_meta(root)
+    files = [file for file in sorted(root.rglob(_META)) if file.is_file()]
     damaged = [str(file) for file in files if not _is_json(file)]
     if damaged:
         raise UnreadableFileError(
             f"{', '.join(damaged)} is damaged, and has no copy to restore: delete the "
             "folder and create the data again"
         )
-    for file in files:
-        with whole_file(file.with_name(_META_COPY)) as partial:
+    for copy in _ended_copies(root):
+        copy.unlink(missing_ok=True)
+    copies = [file.with_name(f"{_META}.{this_process()}.bak") for file in files]
+    for file, copy in zip(files, copies, strict=True):
+        with whole_file(copy) as partial:
             shutil.copyfile(file, partial)
+    _guarded.add(root)
     try:
         yield
     finally:
-        recover_meta(folder)
-        for file in files:
-            file.with_name(_META_COPY).unlink(missing_ok=True)
+        _guarded.discard(root)
+        if _has_damage(root):
+            _restore(root, copies)
+        for copy in copies:
+            copy.unlink(missing_ok=True)
 
 
 def recover_meta(folder: str | os.PathLike[str]) -> bool:
     """Undoes the addition of a leaf that was killed, where :func:`safe_meta` was used.
 
     Nothing happens if every ``meta.json`` can be read. Otherwise, all of them become
-    what they were before the leaf.
+    what they were before the leaf. If another process is adding a leaf right now, this
+    call waits for it.
 
     Args:
         folder (path): the outermost folder of a memory-mapped tensordict.
@@ -199,22 +216,24 @@ def recover_meta(folder: str | os.PathLike[str]) -> bool:
         >>> import tempfile
         >>> from torchrl_caiac._files import recover_meta
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = Path(f"{folder}/meta.json").write_text("")
-        ...     _ = Path(f"{folder}/meta.json.bak").write_text("{}")
-        ...     recover_meta(folder), Path(f"{folder}/meta.json").read_text()
-        (True, '{}')
+        ...     recover_meta(folder)
+        False
     """
-    copies = [
-        file
-        for file in Path(folder).rglob(_META_COPY)
-        if file.is_file() and _is_json(file)
-    ]
-    if not copies or all(_is_json(file) for file in _meta_files(folder)):
+    root = Path(folder).resolve()
+    for _ in range(_TRIES):
+        if not _has_damage(root):
+            return False
+        copies = _ended_copies(root)
+        if copies or not list(root.rglob(_COPIES)):
+            break
+        time.sleep(_SECONDS_BETWEEN_TRIES)
+    if not copies:
         return False
-    # All, not only the damaged one: an outer file may list what an inner one lost.
-    for copy in sorted(copies):
-        with whole_file(copy.with_name(_META)) as partial:
-            shutil.copyfile(copy, partial)
+    # Of the last process, if several were killed.
+    newest = max(copies, key=lambda copy: copy.stat().st_mtime_ns).name
+    _restore(root, [copy for copy in copies if copy.name == newest])
+    for copy in copies:
+        copy.unlink(missing_ok=True)
     _logger.warning(
         "%s: a leaf was being added when a process was killed; meta.json is restored, "
         "without that leaf",
@@ -223,8 +242,33 @@ def recover_meta(folder: str | os.PathLike[str]) -> bool:
     return True
 
 
-def _meta_files(folder: str | os.PathLike[str]) -> list[Path]:
-    return sorted(file for file in Path(folder).rglob(_META) if file.is_file())
+def _restore(root: Path, copies: Sequence[Path]) -> None:
+    # All, not only the damaged one: an outer file may list what an inner one lost.
+    for copy in copies:
+        if _is_json(copy):
+            with whole_file(copy.with_name(_META)) as partial:
+                shutil.copyfile(copy, partial)
+    before = {copy.with_name(_META) for copy in copies}
+    for file in root.rglob(_META):
+        if file not in before and not _is_json(file):
+            file.unlink()  # of the leaf; no other file lists it any more
+
+
+def _ended_copies(root: Path) -> list[Path]:
+    """Returns the copies that processes left which have ended."""
+    ended = []
+    for copy in root.rglob(_COPIES):
+        process = copy.name.removeprefix(f"{_META}.").removesuffix(".bak")
+        over = has_ended(process)
+        if over is None:  # of another machine: a leaf is added in far less time
+            over = time.time() - copy.stat().st_mtime > _SECONDS_TO_ADD_A_LEAF
+        if over and root not in _guarded:
+            ended.append(copy)
+    return ended
+
+
+def _has_damage(root: Path) -> bool:
+    return not all(_is_json(file) for file in root.rglob(_META) if file.is_file())
 
 
 def _is_json(file: Path) -> bool:

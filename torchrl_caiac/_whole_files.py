@@ -13,8 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 __all__ = [
+    "has_ended",
     "remove_leftovers",
     "remove_leftovers_in",
+    "this_process",
     "whole_file",
     "whole_folder",
 ]
@@ -110,8 +112,7 @@ def _partial(path: Path) -> Iterator[Path]:
     """Yields a temporary path that names the process, and that nothing else uses."""
     number = 0
     while True:
-        owner = f"{_machine()}-{os.getpid()}.{number}"
-        partial = path.with_name(f"{_PARTIAL}{owner}-{path.name}")
+        partial = path.with_name(f"{_PARTIAL}{this_process()}.{number}-{path.name}")
         if partial not in _in_use:
             break
         number += 1  # of another thread
@@ -165,11 +166,11 @@ def remove_leftovers_in(folder: str | os.PathLike[str]) -> None:
 def _remove_leftovers(folder: Path, name: str) -> None:
     if not folder.is_dir():
         return
-    owner = rf"{_machine()}-(?P<pid>\d+)\.\d+"
+    owner = r"(?P<owner>\w+-\d+)\.\d+"
     pattern = rf"\.?{re.escape(_PARTIAL)}{owner}-(?P<name>{name})(\.\w+-\w+)*"
     for left in folder.iterdir():
         match = re.fullmatch(pattern, left.name)
-        if match is None or left in _in_use or _is_running(int(match["pid"])):
+        if match is None or left in _in_use or not has_ended(match["owner"]):
             continue
         with contextlib.suppress(OSError):  # a read-only folder, or another was faster
             target, old = folder / match["name"], left / f"{_REPLACED}{match['name']}"
@@ -181,18 +182,46 @@ def _remove_leftovers(folder: Path, name: str) -> None:
                 left.unlink()
 
 
-def _is_running(pid: int) -> bool:
+def this_process() -> str:
+    """Returns a name of this process, for the files that it is writing.
+
+    Returns:
+        str: the machine and the number of the process.
+
+    Examples:
+        >>> from torchrl_caiac._whole_files import this_process
+        >>> this_process().endswith(f"-{os.getpid()}")
+        True
+    """
+    # Numbers of processes are known on their own machine only.
+    return f"{zlib.crc32(platform.node().encode()):08x}-{os.getpid()}"
+
+
+def has_ended(process: str) -> bool | None:
+    """Returns whether a process has ended.
+
+    Args:
+        process (str): its name, from :func:`this_process`.
+
+    Returns:
+        bool, optional: ``True`` for the name of this process too: earlier ones may have
+        had the same number. ``None``: it is of another machine.
+
+    Examples:
+        >>> from torchrl_caiac._whole_files import has_ended, this_process
+        >>> has_ended(this_process())
+        True
+    """
+    machine, _, number = process.rpartition("-")
+    if machine != this_process().rpartition("-")[0]:
+        return None
+    pid = int(number)
     if pid == os.getpid():
-        return False  # an earlier process with the same number: ours is not in use
+        return True
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # it belongs to another user
         return True
-    return True
-
-
-def _machine() -> str:
-    # Numbers of processes are known on their own machine only.
-    return f"{zlib.crc32(platform.node().encode()):08x}"
+    except OSError:  # it belongs to another user
+        return False
+    return False

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from tests.killing import run_killed
 from tests.mutations import mutate_file
 from torchrl_caiac._files import safe_meta
 from torchrl_caiac.data import UnreadableFileError
@@ -275,13 +276,21 @@ class TestVerify:
 
 def test_a_killed_addition_of_a_leaf_is_undone(tmp_path, caplog):
     rows().memmap(tmp_path)
-    data = load_transitions(tmp_path)
-    guard = safe_meta(tmp_path)
-    guard.__enter__()  # and never leaves, as in a killed process
-    data.make_memmap(("caiac", "score"), shape=[6, 2])
-    (tmp_path / "caiac" / "meta.json").write_text("")
+
+    def half():
+        data = load_transitions(tmp_path)
+        with safe_meta(tmp_path):
+            data.make_memmap(("caiac", "score"), shape=[6, 2])
+            (tmp_path / "caiac" / "meta.json").write_text("")
+            yield
+
+    run_killed(half)
     assert ("caiac", "score") not in load_transitions(tmp_path).keys(True)
     assert "without that leaf" in caplog.text
+    # The file of that leaf is left, and taken over by the next one.
+    loaded = load_transitions(tmp_path)
+    loaded.make_memmap(("caiac", "score"), shape=[6, 2]).fill_(3.0)
+    assert (load_transitions(tmp_path)["caiac", "score"] == 3).all()
 
 
 def test_a_read_only_folder_is_read(read_only, tmp_path):

@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import pickle
+from functools import partial
 
 import pytest
 import torch
@@ -192,6 +195,38 @@ def test_truncated_files_are_refused(content, cfg, steps):
             act()
         file.write_bytes(whole)
         act()
+
+
+class Payload:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, folder):
+        self.folder = str(folder)
+
+    def __reduce__(self):
+        return os.mkdir, (self.folder,)
+
+
+def test_no_file_of_a_run_can_run_code(cfg, environment, steps, tmp_path):
+    steps.train.train(cfg, "none", seed=8)
+    steps.evaluate.evaluate(cfg, "none", 8)
+    folder = steps.parts.run_folder(cfg, "none", 8)
+    for name, act in (
+        ("checkpoint.zip", steps.train.train),
+        ("policies/8.pt", partial(steps.train.load_policy, step=8)),
+        ("train.json", steps.evaluate.evaluate),
+        ("evaluation/8.json", steps.evaluate.evaluate),
+    ):
+        file = folder / name
+        whole = file.read_bytes()
+        torch.save({"a": Payload(tmp_path / "marker")}, file)
+        if file.suffix == ".json":
+            file.write_bytes(pickle.dumps(Payload(tmp_path / "marker")))
+        with pytest.raises(ValueError, match=file.name):
+            act(cfg, "none", seed=8)
+        assert not (tmp_path / "marker").exists()
+        file.write_bytes(whole)
+        act(cfg, "none", seed=8)
 
 
 def test_other_settings_are_not_mixed(cfg, steps):

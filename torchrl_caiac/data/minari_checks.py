@@ -218,7 +218,8 @@ def check_hdf5_array(array: Any, file: Path) -> None:
 
     if not isinstance(array, h5py.Dataset):
         raise UnreadableFileError(f"{array.name} in {file} is not an array: {_AGAIN}")
-    if array.is_virtual or array.external:
+    here = Path(array.file.filename).resolve() == file.resolve()
+    if array.is_virtual or array.external or not here:
         raise UnreadableFileError(
             f"{array.name} in {file} is stored in another file: {_AGAIN}"
         )
