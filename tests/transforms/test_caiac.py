@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -22,11 +23,16 @@ from torchrl.data import (
 
 from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import EntityLayout
+from torchrl_caiac._fingerprints import fingerprint_key
+from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.transforms import CAIACTransform, TransformKeys, WindowGoal
+from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 
 THRESHOLD = 0.25
-# Every value names the row and the column it comes from: row * STRIDE + column.
-STRIDE = 32
+# Every value names the row and the column it comes from: row * STRIDE + column. Next
+# states are named like the states of the row after them.
+STRIDE = 16
+DONORS = 64  # the name of the first row of donor buffers
 
 FLAT = EntityLayout(
     {"arm": [0, 4], "cup": [5, 1, 2], "box": [7]},  # columns 3 and 6 are nobody's
@@ -44,13 +50,10 @@ NESTED = EntityLayout.from_keys(
 N = 3
 
 
-def leaf(
-    rows: torch.Tensor, *shape: int, first: int = 0, sign: int = 1
-) -> torch.Tensor:
-    """Values that tell their row and column, negative in next states."""
-    size = math.prod(shape)
-    value = rows.view(-1, 1) * STRIDE + torch.arange(first, first + size)
-    value = value if sign > 0 else -value - 1
+def leaf(rows: torch.Tensor, *shape: int, first: int = 0) -> torch.Tensor:
+    """Values that tell their row and column."""
+    value = rows.view(-1, 1) * STRIDE
+    value = value + torch.arange(first, first + math.prod(shape))
     return value.view(-1, *shape)
 
 
@@ -72,7 +75,7 @@ def make_data(
     td = TensorDict(
         {
             "row": rows,
-            "episode": episode + 10 * int(rows[0] > 0),
+            "episode": episode + 10 * int(rows[0]),
             "action": leaf(rows, 2).to(torch.float32),
             "next": {
                 "reward": rows.to(torch.float32).unsqueeze(-1),
@@ -84,22 +87,22 @@ def make_data(
         },
         [total],
     )
-    for sign, where in ((1, ()), (-1, ("next",))):
+    for names, where in ((rows, ()), (rows + 1, ("next",))):
         if layout.is_flat:
-            parts = {"observation": leaf(rows, 8, sign=sign)}
+            parts = {"observation": leaf(names, 8)}
             if goals:
-                parts["achieved_goal"] = leaf(rows, 3, first=8, sign=sign)
-                parts["desired_goal"] = leaf(rows, 3, first=11, sign=sign)
+                parts["achieved_goal"] = leaf(names, 3, first=8)
+                parts["desired_goal"] = leaf(names, 3, first=11)
         else:
             parts = {
-                ("state", "arm"): leaf(rows, 2, sign=sign),
-                ("state", "cup", "pos"): leaf(rows, 3, first=2, sign=sign),
-                ("state", "cup", "pose", "rot"): leaf(rows, 2, 2, first=5, sign=sign),
-                ("state", "box"): leaf(rows, first=9, sign=sign),
+                ("state", "arm"): leaf(names, 2),
+                ("state", "cup", "pos"): leaf(names, 3, first=2),
+                ("state", "cup", "pose", "rot"): leaf(names, 2, 2, first=5),
+                ("state", "box"): leaf(names, first=9),
             }
             if goals:
-                parts["got", "cup"] = leaf(rows, 2, first=10, sign=sign)
-                parts["goal", "cup"] = leaf(rows, 2, first=12, sign=sign)
+                parts["got", "cup"] = leaf(names, 2, first=10)
+                parts["goal", "cup"] = leaf(names, 2, first=12)
         for key, value in parts.items():
             path = (key,) if isinstance(key, str) else key
             td[(*where, *path)] = value.to(dtype)
@@ -129,35 +132,124 @@ def owner_of(
     return None
 
 
+class KnownScores:
+    """Scores each state by the row that its values name."""
+
+    in_keys = None
+
+    def __init__(self, layout: EntityLayout, scores: dict[int, torch.Tensor]) -> None:
+        self.layout = layout
+        self.scores = scores
+        shape = next(iter(scores.values())).shape
+        self.last = torch.zeros(shape)  # of the states after the last row
+
+    def __call__(self, td: TensorDict) -> torch.Tensor:
+        arm = td["observation"] if self.layout.is_flat else td["state", "arm"]
+        names = (arm[:, 0] // STRIDE).long().tolist()
+        return torch.stack([self.scores.get(name, self.last) for name in names])
+
+
+def score(rb: ReplayBuffer, layout: EntityLayout, key: tuple[str, ...]) -> None:
+    """Replaces stored scores by the same scores with fingerprints."""
+    data = stored(rb)
+    known = dict(zip(data["row"].tolist(), data[key].clone(), strict=True))
+    score_buffer(
+        rb,
+        KnownScores(layout, known),
+        lookahead=0,
+        key=key,
+        overwrite=True,
+        progress=False,
+    )
+
+
+def write_later(
+    rb: ReplayBuffer, later: TensorDict, key: tuple[str, ...], with_leaves: bool
+) -> set[int]:
+    """Adds rows that have no scores, or those of other states; returns their names."""
+    if with_leaves:
+        other = stored(rb)[torch.zeros(len(later), dtype=torch.int64)]
+        for where in (key, fingerprint_key(key)):
+            later[where] = other[where].clone()
+        later[key] = torch.zeros_like(later[key])
+    else:
+        later = later.exclude(key)
+    rb.extend(later)
+    return set(later["row"].tolist())
+
+
 @dataclass
 class Case:
     layout: EntityLayout
     rb: ReplayBuffer
-    transform: CAIACTransform
+    transform: CounterfactualTransform
     donors: ReplayBuffer | None
     window: int
     ratio: float
     swap_prob: float
+    rows: str
+    stale: set[int]  # the rows whose scores must not be used
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        names = [stored(rb)["row"].tolist() for rb in (self.rb, self.donors) if rb]
+        printer.text(f"{self.transform} on rows {names}, stale {self.stale}")
+
+
+def stored(rb: ReplayBuffer) -> TensorDict:
+    """The stored rows ``[T]``."""
+    return rb.storage[:].reshape(-1)
+
+
+def assert_same(td: TensorDict, other: TensorDict) -> None:
+    """Raises where any value of two tensordicts differs; NaN equals NaN."""
+    torch.testing.assert_close(
+        td.to_dict(), other.to_dict(), rtol=0, atol=0, equal_nan=True
+    )
 
 
 def time_order(rb: ReplayBuffer) -> list[int]:
     """The storage's rows from the oldest to the newest: their names increase."""
-    return rb.storage[:]["row"].argsort().tolist()
+    return stored(rb)["row"].argsort().tolist()
 
 
-def donor_windows(
-    rb: ReplayBuffer, layout: EntityLayout, window: int, entity: int
-) -> set[tuple[int, ...]]:
-    """The row names of all windows that may donate an entity, one by one."""
-    order, data, found = time_order(rb), rb.storage[:], set()
+def time_windows(rb: ReplayBuffer, window: int) -> list[list[int]]:
+    """All windows of one trajectory, as rows of the storage, one by one."""
+    order, data, found = time_order(rb), stored(rb), []
     for start in range(len(order) - window + 1):
         part = order[start : start + window]
-        same = len({int(data["episode"][i]) for i in part}) == 1
+        names = data["row"][part].tolist()
+        assert len(set(names)) == window
+        if len(set(data["episode"][part].tolist())) == 1:
+            assert names == list(range(names[0], names[0] + window))
+            found.append(part)
+    return found
+
+
+def donor_windows(case: Case, entity: int) -> set[tuple[int, ...]]:
+    """The row names of all windows that may donate an entity, one by one."""
+    data, found = stored(case.donors), set()
+    for part in time_windows(case.donors, case.window):
+        names = tuple(data["row"][part].tolist())
         # `<=` in float32, as the scores are stored
         free = all(bool(data["caiac", "score"][i, entity] <= THRESHOLD) for i in part)
-        if same and free and layout.names[entity] not in layout.fixed:
-            found.add(tuple(int(data["row"][i]) for i in part))
+        if free and not case.stale & set(names):
+            if case.layout.names[entity] not in case.layout.fixed:
+                found.add(names)
     return found
+
+
+def chosen_windows(case: Case, batch: TensorDict) -> list[bool]:
+    """Which windows became counterfactual, after checks of their number and place."""
+    flags = batch["caiac", "counterfactual"]
+    assert flags.shape == (len(batch), 1) and flags.dtype == torch.bool
+    marked = flags.view(-1, case.window)
+    chosen = marked[:, 0]
+    assert torch.equal(marked, chosen.unsqueeze(-1).expand_as(marked))
+    count = round(case.ratio * len(chosen))
+    assert int(chosen.sum()) == count
+    if case.rows == "last":
+        assert bool(chosen[len(chosen) - count :].all())
+    return chosen.tolist()
 
 
 def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
@@ -167,21 +259,20 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
     """
     layout, window = case.layout, case.window
     total = batch.shape[0] // window
-    first = total - round(case.ratio * total)
+    chosen = chosen_windows(case, batch)
     names = [
         tuple(batch["row"][b * window : (b + 1) * window].tolist())
         for b in range(total)
     ]
-    raw = case.rb.storage[:]
+    raw = stored(case.rb)
     place = {int(row): i for i, row in enumerate(raw["row"])}
-    stored = raw[torch.tensor([place[row] for part in names for row in part])]
-    score = stored["caiac", "score"]
-    swapped, marked = batch["caiac", "swapped"], batch["caiac", "counterfactual"]
+    rows = raw[torch.tensor([place[row] for part in names for row in part])]
+    score, swapped = rows["caiac", "score"], batch["caiac", "swapped"]
     assert swapped.shape == (total * window, N) and swapped.dtype == torch.bool
-    assert marked.shape == (total * window, 1) and marked.dtype == torch.bool
     free = [
         [
             layout.names[n] not in layout.fixed
+            and not case.stale & set(names[b])
             and all(bool(score[b * window + k, n] <= THRESHOLD) for k in range(window))
             for n in range(N)
         ]
@@ -190,21 +281,21 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
     allowed = (
         []
         if case.donors is None
-        else [donor_windows(case.donors, layout, window, n) for n in range(N)]
+        else [donor_windows(case, n) for n in range(N)]
     )
     keys = [
-        key if isinstance(key, tuple) else (key,) for key in stored.keys(True, True)
+        key if isinstance(key, tuple) else (key,) for key in rows.keys(True, True)
     ]
     assert {("caiac", "swapped"), ("caiac", "counterfactual")} == {
         key if isinstance(key, tuple) else (key,) for key in batch.keys(True, True)
     } - set(keys)
     sources: dict[tuple[int, int], set[tuple[int, ...]]] = {}
     for key in keys:
-        value, real = batch[key], stored[key]
+        value, real = batch[key], rows[key]
         assert value.dtype == real.dtype and value.shape == real.shape
         owner = owner_of(layout, key)
         if owner is None:
-            assert torch.equal(value, real), key
+            torch.testing.assert_close(value, real, rtol=0, atol=0, equal_nan=True)
             continue
         value, real = value.reshape(len(value), -1), real.reshape(len(real), -1)
         for column in range(value.shape[1]):
@@ -212,24 +303,21 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
             for b in range(total):
                 part = slice(b * window, (b + 1) * window)
                 n = None if name is None else layout.names.index(name)
-                if b < first or n is None or not bool(swapped[b * window, n]):
+                if not chosen[b] or n is None or not bool(swapped[b * window, n]):
                     assert torch.equal(value[part, column], real[part, column]), key
                     continue
-                coded = value[part, column].double()
-                coded = coded if key[0] != "next" else -coded - 1
-                origin = tuple((coded // STRIDE).long().tolist())
-                own = real[part, column].double()
-                own = own if key[0] != "next" else -own - 1
+                coded, own = value[part, column].double(), real[part, column].double()
+                shift = STRIDE if key[0] == "next" else 0
+                origin = tuple(((coded - shift) // STRIDE).long().tolist())
                 # the same column as before, of another row
                 assert torch.equal(coded % STRIDE, own % STRIDE)
                 sources.setdefault((b, n), set()).add(origin)
     for b in range(total):
-        rows = slice(b * window, (b + 1) * window)
-        assert bool(marked[rows].all()) == bool(marked[rows].any()) == (b >= first)
+        part = slice(b * window, (b + 1) * window)
         for n in range(N):
-            here = swapped[rows, n]
+            here = swapped[part, n]
             assert bool(here.all()) == bool(here.any())
-            if b < first or not free[b][n]:
+            if not chosen[b] or not free[b][n]:
                 assert not here.any()
                 continue
             if case.donors is None:
@@ -260,70 +348,97 @@ def cases(draw: st.DrawFn) -> Case:
     generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
     goals = layout is not FLAT_FREE
 
-    def buffer(offset: int, **kwargs) -> ReplayBuffer:
+    kind = draw(st.sampled_from(["without fingerprints", "scored", "written later"]))
+    stale: set[int] = set()
+
+    def buffer(offset: int, form: str, **kwargs) -> ReplayBuffer:
         parts = [*draw(lengths), draw(st.integers(window, window + 4))]
-        rows = offset + torch.arange(sum(parts))
-        data = make_data(layout, rows, parts, generator, dtype, goals)
-        # a storage smaller than the data is a ring that was written past its end
-        least = max(window, sum(parts) // 2)
-        size = draw(st.integers(least, sum(parts) + 2))
+        later = draw(st.lists(st.integers(1, 3), min_size=1, max_size=2))
+        later = later if kind == "written later" else []
+        total = sum(parts)
+        rows = offset + torch.arange(total + sum(later))
+        data = make_data(layout, rows, parts + later, generator, dtype, goals)
+        data, more = data[:total], data[total:]
         storage = draw(st.sampled_from([LazyTensorStorage, LazyMemmapStorage]))
-        rb = ReplayBuffer(storage=storage(size), **kwargs)
-        for begin in range(0, len(data), least):
-            rb.extend(data[begin : begin + least])
+        if form == "parallel":  # the second half is another environment
+            data["episode"] += 5 * (torch.arange(total) >= total // 2)
+            data = data[: total // 2 * 2].view(2, -1)  # environments, then time
+            rb = ReplayBuffer(storage=storage(max(2, data.numel()), ndim=2), **kwargs)
+            rb.extend(data)
+            more = more[:0]
+        else:
+            if form == "interleaved":
+                # a random order of all rows in which each trajectory is in order
+                ids = data["episode"]
+                mixed = ids[torch.randperm(total, generator=generator)]
+                order = torch.empty(total, dtype=torch.int64)
+                for number in ids.unique():
+                    order[mixed == number] = (ids == number).nonzero()[:, 0]
+                data = data[order]
+            # a storage smaller than the data is a ring that was written past its end
+            least = max(window, total // 2)
+            size = draw(st.integers(least, total + 2))
+            rb = ReplayBuffer(storage=storage(size), **kwargs)
+            for begin in range(0, len(data), least):
+                rb.extend(data[begin : begin + least])
+        if kind != "without fingerprints":
+            score(rb, layout, ("caiac", "score"))
+        if len(more):
+            leaves = draw(st.booleans())
+            stale.update(write_later(rb, more, ("caiac", "score"), leaves))
         return rb
 
     batch = draw(st.integers(1, 8))
     rb = buffer(
         0,
+        "in order",
         batch_size=batch * window,
         sampler=None
         if window == 1
         else SliceSampler(slice_len=window, traj_key="episode"),
     )
-    donors = buffer(STRIDE, batch_size=1) if draw(st.booleans()) else None
+    rb.set_rng(generator)  # a failure can be repeated
+    form = draw(st.sampled_from([None, "in order", "interleaved", "parallel"]))
+    donors = None if form is None else buffer(DONORS, form, batch_size=1)
     ratio = draw(st.sampled_from([0.0, 0.3, 0.5, 0.9, 1.0]))
     swap_prob = draw(st.sampled_from([0.0, 0.5, 1.0]))
+    chosen = draw(st.sampled_from(["random", "last"]))
     transform = CAIACTransform(
         layout,
         threshold=THRESHOLD,
         counterfactual_ratio=ratio,
+        rows=chosen,
         swap_prob=swap_prob,
         window=window,
         donors=donors,
+        unscored="keep" if kind == "written later" else "raise",
         generator=generator,
     )
-    return Case(layout, rb, transform, donors, window, ratio, swap_prob)
-
-
-def has_long_enough(rb: ReplayBuffer, window: int) -> bool:
-    order, data = time_order(rb), rb.storage[:]
-    return any(
-        len({int(data["episode"][i]) for i in order[s : s + window]}) == 1
-        for s in range(len(order) - window + 1)
-    )
+    return Case(layout, rb, transform, donors, window, ratio, swap_prob, chosen, stale)
 
 
 @settings(
-    max_examples=80,
-    deadline=None,
+    max_examples=150,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(case=cases())
 def test_invariants(case: Case) -> None:
-    if not has_long_enough(case.rb, case.window):
-        return
+    if not time_windows(case.rb, case.window):
+        return  # the ring left no trajectory as long as the window
     before = case.rb.storage[:].clone()
     others = None if case.donors is None else case.donors.storage[:].clone()
     case.rb.append_transform(case.transform)
-    missing = [0] * N
+    missing, unscored = [0] * N, 0
     for _ in range(2):
-        missing = check_batch(case, case.rb.sample(), missing)
+        batch = case.rb.sample()
+        missing = check_batch(case, batch, missing)
+        unscored += sum(row in case.stale for row in batch["row"].tolist())
     if case.swap_prob == 1.0:
         assert case.transform.no_donor_count.tolist() == missing
-    assert (case.rb.storage[:] == before).all()
+    assert case.transform.unscored_count == unscored
+    assert_same(case.rb.storage[:], before)
     if others is not None:
-        assert (case.donors.storage[:] == others).all()
+        assert_same(case.donors.storage[:], others)
 
 
 # --- small fixed data ----------------------------------------------------------------
