@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -16,213 +15,34 @@ from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
     ReplayBuffer,
-    SliceSampler,
+    ReplayBufferEnsemble,
     TensorDictReplayBuffer,
     TensorStorage,
 )
 
 from tests.pretend_cuda import nothing_waits
+from tests.transforms.oracle import (
+    DONORS,
+    FLAT,
+    FLAT_FREE,
+    FORMS,
+    KINDS,
+    NESTED,
+    STRIDE,
+    THRESHOLD,
+    Case,
+    N,
+    check_samples,
+    chosen_windows,
+    draw_buffer,
+    leaf,
+    make_data,
+    owner_of,
+    slices,
+    stored,
+)
 from torchrl_caiac import EntityLayout
-from torchrl_caiac._fingerprints import fingerprint_key
-from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.transforms import CAIACTransform, TransformKeys, WindowGoal
-from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
-
-THRESHOLD = 0.25
-# Every value names the row and the column it comes from: row * STRIDE + column. Next
-# states are named like the states of the row after them.
-STRIDE = 16
-DONORS = 64  # the name of the first row of donor buffers
-
-FLAT = EntityLayout(
-    {"arm": [0, 4], "cup": [5, 1, 2], "box": [7]},  # columns 3 and 6 are nobody's
-    goal={"cup": [2, 0], "box": [1]},
-    achieved={"cup": [1, 2], "box": [7]},
-    fixed=["arm"],
-)
-FLAT_FREE = EntityLayout({"arm": [0, 4], "cup": [5, 1, 2], "box": [7]})
-NESTED = EntityLayout.from_keys(
-    {"arm": ("state", "arm"), "cup": ("state", "cup"), "box": ("state", "box")},
-    goal={"cup": ("goal", "cup"), "box": None},
-    achieved={"cup": ("got", "cup"), "box": None},
-    fixed=["arm"],
-)
-N = 3
-
-
-def leaf(rows: torch.Tensor, *shape: int, first: int = 0) -> torch.Tensor:
-    """Values that tell their row and column."""
-    value = rows.view(-1, 1) * STRIDE
-    value = value + torch.arange(first, first + math.prod(shape))
-    return value.view(-1, *shape)
-
-
-def make_data(
-    layout: EntityLayout,
-    rows: torch.Tensor,
-    lengths: list[int],
-    generator: torch.Generator,
-    dtype: torch.dtype = torch.float32,
-    goals: bool = True,
-) -> TensorDict:
-    """Rows of trajectories whose every value names its row."""
-    total = len(rows)
-    episode = torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths))
-    end = torch.zeros(total, 1, dtype=torch.bool)
-    end[torch.tensor(lengths).cumsum(0) - 1] = True
-    score = torch.rand(total, N, generator=generator)
-    score[torch.rand(total, N, generator=generator) < 0.6] = 0.0
-    td = TensorDict(
-        {
-            "row": rows,
-            "episode": episode + 10 * int(rows[0]),
-            "action": leaf(rows, 2).to(torch.float32),
-            "next": {
-                "reward": rows.to(torch.float32).unsqueeze(-1),
-                "done": end,
-                "terminated": torch.zeros_like(end),
-                "truncated": end.clone(),
-            },
-            ("caiac", "score"): score,
-        },
-        [total],
-    )
-    for names, where in ((rows, ()), (rows + 1, ("next",))):
-        if layout.is_flat:
-            parts = {"observation": leaf(names, 8)}
-            if goals:
-                parts["achieved_goal"] = leaf(names, 3, first=8)
-                parts["desired_goal"] = leaf(names, 3, first=11)
-        else:
-            parts = {
-                ("state", "arm"): leaf(names, 2),
-                ("state", "cup", "pos"): leaf(names, 3, first=2),
-                ("state", "cup", "pose", "rot"): leaf(names, 2, 2, first=5),
-                ("state", "box"): leaf(names, first=9),
-            }
-            if goals:
-                parts["got", "cup"] = leaf(names, 2, first=10)
-                parts["goal", "cup"] = leaf(names, 2, first=12)
-        for key, value in parts.items():
-            path = (key,) if isinstance(key, str) else key
-            td[(*where, *path)] = value.to(dtype)
-    return td
-
-
-def owner_of(
-    layout: EntityLayout, key: tuple[str, ...]
-) -> list[str | None] | str | None:
-    """Which entity a leaf, or each column of it, must follow."""
-    if key[0] == "next":
-        key = key[1:]
-    if not layout.is_flat:
-        return key[1] if key[0] in ("state", "got", "goal") else None
-    if key == ("observation",):
-        owner: list[str | None] = [None] * 8
-        for name, columns in layout.columns.items():
-            for column in columns:
-                owner[column] = name
-        return owner
-    if key in (("achieved_goal",), ("desired_goal",)):
-        owner = [None] * 3
-        for name, columns in layout.goal.items():
-            for column in columns:
-                owner[column] = name
-        return owner
-    return None
-
-
-class KnownScores:
-    """Scores each state by the row that its values name."""
-
-    in_keys = None
-
-    def __init__(self, layout: EntityLayout, scores: dict[int, torch.Tensor]) -> None:
-        self.layout = layout
-        self.scores = scores
-        shape = next(iter(scores.values())).shape
-        self.last = torch.zeros(shape)  # of the states after the last row
-
-    def __call__(self, td: TensorDict) -> torch.Tensor:
-        arm = td["observation"] if self.layout.is_flat else td["state", "arm"]
-        names = (arm[:, 0] // STRIDE).long().tolist()
-        return torch.stack([self.scores.get(name, self.last) for name in names])
-
-
-def score(rb: ReplayBuffer, layout: EntityLayout, key: tuple[str, ...]) -> None:
-    """Replaces stored scores by the same scores with fingerprints."""
-    data = stored(rb)
-    known = dict(zip(data["row"].tolist(), data[key].clone(), strict=True))
-    score_buffer(
-        rb,
-        KnownScores(layout, known),
-        lookahead=0,
-        key=key,
-        overwrite=True,
-        progress=False,
-    )
-
-
-def write_later(
-    rb: ReplayBuffer, later: TensorDict, key: tuple[str, ...], with_leaves: bool
-) -> set[int]:
-    """Adds rows that have no scores, or those of other states; returns their names."""
-    if with_leaves:
-        other = stored(rb)[torch.zeros(len(later), dtype=torch.int64)]
-        for where in (key, fingerprint_key(key)):
-            later[where] = other[where].clone()
-        later[key] = torch.zeros_like(later[key])
-    else:
-        later = later.exclude(key)
-    rb.extend(later)
-    return set(later["row"].tolist())
-
-
-@dataclass
-class Case:
-    layout: EntityLayout
-    rb: ReplayBuffer
-    transform: CounterfactualTransform
-    donors: ReplayBuffer | None
-    window: int
-    ratio: float
-    swap_prob: float
-    rows: str
-    stale: set[int]  # the rows whose scores must not be used
-
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        names = [stored(rb)["row"].tolist() for rb in (self.rb, self.donors) if rb]
-        printer.text(f"{self.transform} on rows {names}, stale {self.stale}")
-
-
-def stored(rb: ReplayBuffer) -> TensorDict:
-    """The stored rows ``[T]``."""
-    return rb.storage[:].reshape(-1)
-
-
-def assert_same(td: TensorDict, other: TensorDict) -> None:
-    """Raises where any value of two tensordicts differs; NaN equals NaN."""
-    torch.testing.assert_close(
-        td.to_dict(), other.to_dict(), rtol=0, atol=0, equal_nan=True
-    )
-
-
-def time_order(rb: ReplayBuffer) -> list[int]:
-    """The storage's rows from the oldest to the newest: their names increase."""
-    return stored(rb)["row"].argsort().tolist()
-
-
-def time_windows(rb: ReplayBuffer, window: int) -> list[list[int]]:
-    """All windows of one trajectory, as rows of the storage, one by one."""
-    order, data, found = time_order(rb), stored(rb), []
-    for start in range(len(order) - window + 1):
-        part = order[start : start + window]
-        names = data["row"][part].tolist()
-        assert len(set(names)) == window
-        if len(set(data["episode"][part].tolist())) == 1:
-            assert names == list(range(names[0], names[0] + window))
-            found.append(part)
-    return found
 
 
 def donor_windows(case: Case, entity: int) -> set[tuple[int, ...]]:
@@ -232,30 +52,16 @@ def donor_windows(case: Case, entity: int) -> set[tuple[int, ...]]:
         names = tuple(data["row"][part].tolist())
         # `<=` in float32, as the scores are stored
         free = all(bool(data["caiac", "score"][i, entity] <= THRESHOLD) for i in part)
-        if free and not case.stale & set(names):
-            if case.layout.names[entity] not in case.layout.fixed:
-                found.add(names)
+        may = case.layout.names[entity] not in case.layout.fixed
+        if may and free and not case.stale & set(names):
+            found.add(names)
     return found
 
 
-def chosen_windows(case: Case, batch: TensorDict) -> list[bool]:
-    """Which windows became counterfactual, after checks of their number and place."""
-    flags = batch["caiac", "counterfactual"]
-    assert flags.shape == (len(batch), 1) and flags.dtype == torch.bool
-    marked = flags.view(-1, case.window)
-    chosen = marked[:, 0]
-    assert torch.equal(marked, chosen.unsqueeze(-1).expand_as(marked))
-    count = round(case.ratio * len(chosen))
-    assert int(chosen.sum()) == count
-    if case.rows == "last":
-        assert bool(chosen[len(chosen) - count :].all())
-    return chosen.tolist()
-
-
-def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
+def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> None:
     """Raises where the batch is anything that section 3's invariants forbid.
 
-    Returns how often each entity lacked a donor.
+    Adds to ``missing`` how often each entity lacked a donor.
     """
     layout, window = case.layout, case.window
     total = batch.shape[0] // window
@@ -278,14 +84,8 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
         ]
         for b in range(total)
     ]
-    allowed = (
-        []
-        if case.donors is None
-        else [donor_windows(case, n) for n in range(N)]
-    )
-    keys = [
-        key if isinstance(key, tuple) else (key,) for key in rows.keys(True, True)
-    ]
+    allowed = [] if case.donors is None else [donor_windows(case, n) for n in range(N)]
+    keys = [key if isinstance(key, tuple) else (key,) for key in rows.keys(True, True)]
     assert {("caiac", "swapped"), ("caiac", "counterfactual")} == {
         key if isinstance(key, tuple) else (key,) for key in batch.keys(True, True)
     } - set(keys)
@@ -332,10 +132,6 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> list[int]:
             if here.any():
                 assert len(sources[b, n]) == 1
                 assert next(iter(sources[b, n])) in options
-    return missing
-
-
-lengths = st.lists(st.integers(1, 9), min_size=1, max_size=4)
 
 
 @st.composite
@@ -346,59 +142,22 @@ def cases(draw: st.DrawFn) -> Case:
         st.sampled_from([torch.float32, torch.float64, torch.float16, torch.int64])
     )
     generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
-    goals = layout is not FLAT_FREE
-
-    kind = draw(st.sampled_from(["without fingerprints", "scored", "written later"]))
+    kind = draw(st.sampled_from(KINDS))
     stale: set[int] = set()
 
-    def buffer(offset: int, form: str, **kwargs) -> ReplayBuffer:
-        parts = [*draw(lengths), draw(st.integers(window, window + 4))]
-        later = draw(st.lists(st.integers(1, 3), min_size=1, max_size=2))
-        later = later if kind == "written later" else []
-        total = sum(parts)
-        rows = offset + torch.arange(total + sum(later))
-        data = make_data(layout, rows, parts + later, generator, dtype, goals)
-        data, more = data[:total], data[total:]
-        storage = draw(st.sampled_from([LazyTensorStorage, LazyMemmapStorage]))
-        if form == "parallel":  # the second half is another environment
-            data["episode"] += 5 * (torch.arange(total) >= total // 2)
-            data = data[: total // 2 * 2].view(2, -1)  # environments, then time
-            rb = ReplayBuffer(storage=storage(max(2, data.numel()), ndim=2), **kwargs)
-            rb.extend(data)
-            more = more[:0]
-        else:
-            if form == "interleaved":
-                # a random order of all rows in which each trajectory is in order
-                ids = data["episode"]
-                mixed = ids[torch.randperm(total, generator=generator)]
-                order = torch.empty(total, dtype=torch.int64)
-                for number in ids.unique():
-                    order[mixed == number] = (ids == number).nonzero()[:, 0]
-                data = data[order]
-            # a storage smaller than the data is a ring that was written past its end
-            least = max(window, total // 2)
-            size = draw(st.integers(least, total + 2))
-            rb = ReplayBuffer(storage=storage(size), **kwargs)
-            for begin in range(0, len(data), least):
-                rb.extend(data[begin : begin + least])
-        if kind != "without fingerprints":
-            score(rb, layout, ("caiac", "score"))
-        if len(more):
-            leaves = draw(st.booleans())
-            stale.update(write_later(rb, more, ("caiac", "score"), leaves))
-        return rb
+    def buffer(first: int, form: str, **kwargs: Any) -> ReplayBuffer:
+        def data(*args: Any) -> TensorDict:
+            return make_data(layout, *args, generator, dtype, layout is not FLAT_FREE)
+
+        key = ("caiac", "score")
+        return draw_buffer(
+            draw, data, layout, key, first, form, window, kind, stale, **kwargs
+        )
 
     batch = draw(st.integers(1, 8))
-    rb = buffer(
-        0,
-        "in order",
-        batch_size=batch * window,
-        sampler=None
-        if window == 1
-        else SliceSampler(slice_len=window, traj_key="episode"),
-    )
+    rb = buffer(0, "in order", batch_size=batch * window, sampler=slices(window))
     rb.set_rng(generator)  # a failure can be repeated
-    form = draw(st.sampled_from([None, "in order", "interleaved", "parallel"]))
+    form = draw(st.sampled_from(FORMS))
     donors = None if form is None else buffer(DONORS, form, batch_size=1)
     ratio = draw(st.sampled_from([0.0, 0.3, 0.5, 0.9, 1.0]))
     swap_prob = draw(st.sampled_from([0.0, 0.5, 1.0]))
@@ -418,27 +177,12 @@ def cases(draw: st.DrawFn) -> Case:
 
 
 @settings(
-    max_examples=150,
+    max_examples=100,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(case=cases())
 def test_invariants(case: Case) -> None:
-    if not time_windows(case.rb, case.window):
-        return  # the ring left no trajectory as long as the window
-    before = case.rb.storage[:].clone()
-    others = None if case.donors is None else case.donors.storage[:].clone()
-    case.rb.append_transform(case.transform)
-    missing, unscored = [0] * N, 0
-    for _ in range(2):
-        batch = case.rb.sample()
-        missing = check_batch(case, batch, missing)
-        unscored += sum(row in case.stale for row in batch["row"].tolist())
-    if case.swap_prob == 1.0:
-        assert case.transform.no_donor_count.tolist() == missing
-    assert case.transform.unscored_count == unscored
-    assert_same(case.rb.storage[:], before)
-    if others is not None:
-        assert_same(case.donors.storage[:], others)
+    check_samples(case, check_batch)
 
 
 # --- small fixed data ----------------------------------------------------------------
@@ -463,11 +207,11 @@ def small(
     )
     if free:
         data["caiac", "score"].zero_()
-    sampler = (
-        None if window == 1 else SliceSampler(slice_len=window, traj_key="episode")
-    )
     rb = ReplayBuffer(
-        storage=storage(size), sampler=sampler, batch_size=batch * window, **kwargs
+        storage=storage(size),
+        sampler=slices(window),
+        batch_size=batch * window,
+        **kwargs,
     )
     rb.extend(data)
     return rb
@@ -558,13 +302,70 @@ def test_swap_prob_is_a_probability() -> None:
 
 @pytest.mark.parametrize("window", [1, 3])
 @pytest.mark.parametrize("ratio", [0.0, 0.25, 0.5, 1.0])
-def test_share_of_counterfactuals(window: int, ratio: float) -> None:
+@pytest.mark.parametrize("rows", ["random", "last"])
+def test_share_of_counterfactuals(window: int, ratio: float, rows: str) -> None:
     rb = small(window=window, batch=7)
-    rb.append_transform(CAIACTransform(FLAT, counterfactual_ratio=ratio, window=window))
-    marked = rb.sample()["caiac", "counterfactual"].view(7, window)
+    rb.append_transform(CAIACTransform(FLAT, 0.05, ratio, rows=rows, window=window))
     count = round(ratio * 7)
-    assert marked.sum() == count * window
-    assert marked[7 - count :].all()
+    for _ in range(5):
+        batch = rb.sample()
+        marked = batch["caiac", "counterfactual"].view(7, window)
+        assert marked.sum() == count * window
+        assert (marked.all(1) == marked.any(1)).all()  # windows stay whole
+        # There is always a donor here, so that every chosen window is swapped.
+        swapped = batch["caiac", "swapped"][:, 1:]
+        assert torch.equal(swapped, marked.view(-1, 1).expand(-1, 2))
+        if rows == "last":
+            assert marked[7 - count :].all()
+
+
+@pytest.mark.parametrize("window", [1, 2])
+@pytest.mark.parametrize("donor", [False, True])
+def test_each_window_is_as_likely_to_be_counterfactual(window: int, donor) -> None:
+    transform = CAIACTransform(
+        FLAT,
+        0.05,
+        0.3,
+        window=window,
+        donors=small() if donor else None,
+        generator=torch.Generator().manual_seed(0),
+    )
+    batches, total = 3000, 8  # of which two are chosen
+    scores = torch.zeros(total * window, N)
+    pairs = torch.zeros(total, total)
+    for _ in range(batches):
+        chosen = transform.generate_parameters(scores).windows
+        assert chosen.dtype == torch.int64 and chosen[0] < chosen[1]
+        pairs[chosen[0], chosen[1]] += 1
+    # All 28 pairs are drawn as often as each other.
+    expected = batches / 28
+    counts = pairs[torch.ones(total, total).triu(1).bool()]
+    assert ((counts - expected) ** 2 / expected).sum() < 55.5  # 27 degrees, p = 0.001
+
+
+def test_the_share_of_swapped_rows_is_the_same_wherever_they_are() -> None:
+    td = small(batch=20).sample()
+    for ratio in (0.3, 1.0):
+        counts = []
+        for rows in ("random", "last"):
+            out = CAIACTransform(FLAT, counterfactual_ratio=ratio, rows=rows)(td)
+            counts.append(out["caiac", "swapped"].sum(0).tolist())
+        assert counts[0] == counts[1] == [0, round(20 * ratio), round(20 * ratio)]
+
+
+def test_chosen_rows_are_drawn_by_the_generator_alone() -> None:
+    td = small(batch=50).sample()
+    transform = CAIACTransform(FLAT)
+    transform.set_generator(torch.Generator().manual_seed(1))
+    torch.manual_seed(0)
+    one, state = transform(td), torch.get_rng_state()
+    torch.manual_seed(0)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(5)
+    transform.set_generator(torch.Generator().manual_seed(1))
+    assert (transform(td) == one).all()
+    marked = [transform(td)["caiac", "counterfactual"] for _ in range(2)]
+    assert not torch.equal(*marked)
 
 
 def test_rewards_of_counterfactual_rows_come_from_next_achieved_goals() -> None:
@@ -577,7 +378,7 @@ def test_rewards_of_counterfactual_rows_come_from_next_achieved_goals() -> None:
     for layout in (FLAT, NESTED):
         rb = small(layout, batch=6)
         raw = rb.sample()
-        out = CAIACTransform(layout, reward_fn=reward)(raw)
+        out = CAIACTransform(layout, reward_fn=reward, rows="last")(raw)
         achieved, desired = ("achieved_goal", "desired_goal")
         if layout is NESTED:
             achieved, desired = ("got", "cup"), ("goal", "cup")
@@ -588,6 +389,24 @@ def test_rewards_of_counterfactual_rows_come_from_next_achieved_goals() -> None:
         assert torch.equal(out["next", "reward"][3:], wanted[3:])
         assert torch.equal(out["next", "reward"][:3], raw["next", "reward"][:3])
         assert (out["next", "reward"][3:] != raw["next", "reward"][3:]).any()
+
+
+def test_rewards_of_random_rows_are_their_own() -> None:
+    rb = small(window=2, batch=9)
+    raw = rb.sample()
+    out = CAIACTransform(
+        FLAT,
+        0.05,
+        0.4,
+        window=2,
+        reward_fn=lambda a, d: (a - 2 * d).sum(-1),
+        generator=torch.Generator().manual_seed(4),
+    )(raw)
+    marked = out["caiac", "counterfactual"][:, 0]
+    assert marked.sum() == 8 and not marked[-8:].all()
+    wanted = (out["next", "achieved_goal"] - 2 * out["desired_goal"]).sum(-1, True)
+    wanted = torch.where(marked.unsqueeze(-1), wanted, raw["next", "reward"])
+    assert torch.equal(out["next", "reward"], wanted)
 
 
 def test_rewards_from_observation_columns() -> None:
@@ -666,8 +485,9 @@ def test_works_under_prefetch_and_in_a_tensordict_buffer() -> None:
     rb.append_transform(CAIACTransform(FLAT))
     for _ in range(5):
         batch = rb.sample()
-        assert batch["caiac", "swapped"][3:, 1:].all()
-        assert not batch["caiac", "swapped"][:3].any()
+        marked = batch["caiac", "counterfactual"]
+        assert marked.sum() == 3
+        assert torch.equal(batch["caiac", "swapped"][:, 1:], marked.expand(-1, 2))
 
 
 # --- donor buffers -------------------------------------------------------------------
@@ -751,12 +571,12 @@ def test_goals_of_donor_windows(layout: EntityLayout, window: int) -> None:
     if layout is FLAT:
         # goal column 2, 0 of the cup mirror observation columns 1, 2
         for column, mirrored, entity in ((2, 1, 1), (0, 2, 1), (1, 7, 2)):
-            wanted = -(last[:, entity] * STRIDE + mirrored) - 1.0
+            wanted = (last[:, entity] + 1.0) * STRIDE + mirrored
             wanted = wanted.repeat_interleave(window)
             assert torch.equal(out["desired_goal"][:, column], wanted)
             assert torch.equal(out["next", "desired_goal"][:, column], wanted)
     else:
-        wanted = leaf(last[:, 1], 2, first=10, sign=-1).float()
+        wanted = leaf(last[:, 1] + 1, 2, first=10).float()
         wanted = wanted.repeat_interleave(window, 0)
         assert torch.equal(out["goal", "cup"], wanted)
 
@@ -813,10 +633,6 @@ def test_donor_buffer_errors() -> None:
     bad["observation"][:, 5] = math.nan
     with pytest.raises(ValueError, match="'observation' is not finite"):
         transform(bad)(td)
-    two = ReplayBuffer(storage=LazyTensorStorage(20, ndim=2))
-    two.extend(good.view(2, 10))
-    with pytest.raises(ValueError, match="ndim=2, expected a one-dimensional"):
-        CAIACTransform(FLAT, donors=two)(td)
 
 
 def test_donors_are_not_read_where_nothing_is_swapped() -> None:
@@ -924,11 +740,49 @@ def test_windows_that_do_not_fit() -> None:
     with pytest.raises(ValueError, match="window 0 of 4 rows crosses"):
         CAIACTransform(FLAT, window=4)(rb.storage[8:16].exclude("episode"))
     out = CAIACTransform(FLAT, window=4)(rb.storage[2:10].exclude("episode"))
-    assert out["caiac", "swapped"][4:, 1:].all()
-    with pytest.raises(ValueError, match=r"shape \[2, 4\], expected \[B"):
-        CAIACTransform(FLAT)(td.view(2, 4))
-    with pytest.raises(ValueError, match=r"shape \[0\]"):
+    assert out["caiac", "swapped"][:, 1:].sum() == 8
+    with pytest.raises(ValueError, match="no rows: sample from a buffer that is not"):
         CAIACTransform(FLAT)(td[:0])
+
+
+@pytest.mark.parametrize("window", [1, 2])
+@pytest.mark.parametrize("shape", [(12,), (3, 4), (2, 3, 2)])
+def test_batches_with_several_dimensions(window: int, shape: tuple[int, ...]) -> None:
+    td = small(window=2, batch=6).sample()
+    found = []
+    for part in (td, td.view(shape)):
+        transform = CAIACTransform(FLAT, window=window, swap_prob=0.5)
+        transform.set_generator(torch.Generator().manual_seed(2))
+        found.append(transform(part))
+    assert found[1].batch_size == shape and found[0]["caiac", "swapped"].any()
+    assert found[1]["caiac", "swapped"].shape == (*shape, N)
+    assert (found[1].reshape(-1) == found[0]).all()
+
+
+def test_windows_lie_along_the_last_dimension() -> None:
+    td = small(window=2, batch=6).sample()
+    message = r"shape \[4, 3\], whose last dimension is not a multiple of the window 2"
+    with pytest.raises(ValueError, match=message):
+        CAIACTransform(FLAT, window=2)(td.view(4, 3))
+    with pytest.raises(ValueError, match=r"shape \[\], whose last dimension"):
+        CAIACTransform(FLAT)(td[0])
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_an_ensemble_of_buffers(window: int) -> None:
+    buffers = [small(window=window, batch=4) for _ in range(2)]
+    rb = ReplayBufferEnsemble(*buffers, batch_size=8 * window)
+    rb.append_transform(CAIACTransform(FLAT, window=window))
+    batch = rb.sample()
+    assert batch.batch_size == (2, 4 * window)
+    marked = batch["caiac", "counterfactual"].view(-1, window)
+    assert marked.sum() == 4 * window and torch.equal(marked.all(1), marked.any(1))
+    assert batch["caiac", "swapped"].sum() == 8 * window
+    # Donors are windows of both buffers, as one batch.
+    own = batch["row"].view(-1, window)
+    source = (batch["observation"][..., 5] // STRIDE).long().view(-1, window)
+    assert torch.equal(source[~marked[:, 0]], own[~marked[:, 0]])
+    assert all(row in own.tolist() for row in source.tolist())
 
 
 def test_trajectories_shorter_than_the_window_and_empty_buffers() -> None:
@@ -968,34 +822,6 @@ def test_large_finite_values_pass() -> None:
 # --- writing, copying ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
-def test_rows_extended_without_scores_count_as_unscored(storage) -> None:
-    rb = small(storage=storage, size=30, batch=4)
-    rb.append_transform(CAIACTransform(FLAT))
-    more = small().storage[:5].exclude("caiac")
-    rb.extend(more)
-    rb.add(more[0])
-    score = rb.storage[:]["caiac", "score"]
-    assert score[20:].isnan().all() and not score[:20].isnan().any()
-    assert ("caiac", "score") not in more.keys(True, True)
-    rb.extend(small().storage[:4])  # scores of other rows must not pass for theirs
-    assert rb.storage[:]["caiac", "score"][-4:].isnan().all()
-    with pytest.raises(ValueError, match="not scored"):
-        for _ in range(50):
-            rb.sample()
-
-
-def test_float64_scores_stay_float64_when_rows_are_written() -> None:
-    rb = ReplayBuffer(storage=LazyTensorStorage(30), batch_size=4)
-    data = small().storage[:]
-    data["caiac", "score"] = data["caiac", "score"].double()
-    rb.extend(data)
-    rb.append_transform(CAIACTransform(FLAT))
-    rb.extend(data[:5])
-    score = rb.storage[:]["caiac", "score"]
-    assert score.dtype == torch.float64 and score[20:].isnan().all()
-
-
 def test_pickle_and_clone() -> None:
     donors = small()
     transform = CAIACTransform(FLAT, donors=donors, counterfactual_ratio=1.0)
@@ -1017,7 +843,7 @@ def test_pickle_and_clone() -> None:
 @pytest.mark.parametrize("layout", [FLAT, NESTED])
 def test_on_the_gpu(layout: EntityLayout) -> None:
     td = small(layout, batch=8).sample().to("cuda")
-    transform = CAIACTransform(layout, check=False)
+    transform = CAIACTransform(layout, check=False, rows="last")
     transform(td)
     with nothing_waits():
         out = transform(td)
