@@ -40,6 +40,7 @@ from tests.transforms.oracle import (
     owner_of,
     slices,
     stored,
+    time_windows,
 )
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.transforms import CAIACTransform, TransformKeys, WindowGoal

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms import (
@@ -23,10 +24,12 @@ KEYS = TransformKeys(trajectory="run")
 SETTINGS: dict[str, Any] = {
     "threshold": 0.1,
     "counterfactual_ratio": 0.5,
+    "rows": "last",
     "swap_prob": 1.0,
     "window": 1,
     "donors": None,
     "score_key": "age",
+    "unscored": "raise",
     "reward_fn": None,
     "goals": None,
     "generator": None,
@@ -45,9 +48,13 @@ class FromTheFirst(CounterfactualTransform):
     def draw_in_batch(
         free: torch.Tensor, num_counterfactual: int, **settings: Any
     ) -> SwapDraw:
+        windows = settings.pop("windows")
         assert settings == {"window": 1, "swap_prob": 1.0, "generator": None}
         tail = free[len(free) - num_counterfactual :]
-        return SwapDraw(torch.zeros_like(tail, dtype=torch.int64), tail, tail.sum(0))
+        if windows is not None:
+            tail = free[windows]
+        donors = torch.zeros_like(tail, dtype=torch.int64)
+        return SwapDraw(donors, tail, tail.sum(0), windows=windows)
 
 
 def batch() -> TensorDict:
@@ -71,10 +78,67 @@ def test_a_subclass_says_what_is_swapped_and_with_whom() -> None:
     assert (td == batch()).all()
 
 
+def test_a_subclass_gets_the_windows_that_were_drawn() -> None:
+    td, seen = batch(), set()
+    transform = FromTheFirst(LAYOUT, **{**SETTINGS, "rows": "random"})
+    transform.set_generator(None)
+    for _ in range(60):
+        out = transform(td)
+        marked = out["caiac", "counterfactual"]
+        seen.add(tuple(marked.flatten().tolist()))
+        young = (td["age"] <= 0.1) & marked
+        assert torch.equal(out["caiac", "swapped"], young)
+        expected = torch.where(young, td["observation"][0], td["observation"])
+        assert torch.equal(out["observation"], expected)
+    assert len(seen) == 6 and all(sum(marked) == 2 for marked in seen)
+
+
 def test_it_moves_as_any_module() -> None:
     transform = FromTheFirst(LAYOUT, **SETTINGS).to("cpu").float()
     assert (transform(batch())["observation"] == batch()["observation"]).any()
-    assert list(transform.parameters()) == [] and transform.state_dict() == {}
+    assert list(transform.parameters()) == []
+    assert list(transform.state_dict()) == ["_extra_state"]
+
+
+def test_the_state_of_the_generator_is_saved() -> None:
+    td = batch()
+    td["age"] = torch.zeros(4, 2)
+
+    def transform(seed: int) -> CAIACTransform:
+        generator = torch.Generator().manual_seed(seed)
+        return CAIACTransform(LAYOUT, score_key="age", generator=generator)
+
+    one, other = transform(0), transform(1)
+    one(td)
+    other.load_state_dict(one.state_dict())
+    for _ in range(5):
+        assert (one(td) == other(td)).all()
+    without = CAIACTransform(LAYOUT, score_key="age")
+    without.load_state_dict(one.state_dict())  # has no generator, and gets none
+    assert without.generator is None
+    state = other.generator.get_state()
+    other.load_state_dict(without.state_dict())  # keeps its own
+    assert torch.equal(other.generator.get_state(), state)
+
+
+def test_the_state_of_a_buffer_contains_that_of_the_generator() -> None:
+    def buffer() -> ReplayBuffer:
+        rb = ReplayBuffer(storage=LazyTensorStorage(4), batch_size=4)
+        td = batch()
+        td["age"] = torch.zeros(4, 2)
+        rb.extend(td)
+        generator = torch.Generator().manual_seed(7)
+        rb.append_transform(
+            CAIACTransform(LAYOUT, score_key="age", generator=generator)
+        )
+        return rb
+
+    one, other = buffer(), buffer()
+    for _ in range(3):
+        one.sample()
+    other.load_state_dict(one.state_dict())
+    for _ in range(3):
+        assert (one[:] == other[:]).all()
 
 
 def test_what_a_subclass_lacks_is_named() -> None:
@@ -88,9 +152,14 @@ def test_both_augmentations_take_the_same_options(transform: Any) -> None:
     made = transform(LAYOUT, **options)
     assert isinstance(made, CounterfactualTransform)
     for name, value in options.items():
-        if name != "goals":
+        if name not in ("goals", "rows"):
             assert getattr(made, name) == value
+    assert made.chosen_rows == "last" and transform(LAYOUT).chosen_rows == "random"
     assert transform(LAYOUT).keys == TransformKeys()
+    assert transform(LAYOUT).unscored == "raise"
+    for name in ("rows", "unscored"):
+        with pytest.raises(ValueError, match=f"{name} must be '.*' or '.*', got 'no'"):
+            transform(LAYOUT, **{name: "no"})
 
 
 @pytest.mark.parametrize("transform", [CAIACTransform, CoDATransform])
@@ -110,11 +179,13 @@ def test_keys_that_are_read_and_written() -> None:
     state = ["observation", ("next", "observation")]
     made = CAIACTransform(LAYOUT, score_key="age")
     flags = [("caiac", "counterfactual"), ("caiac", "swapped")]
-    assert made.in_keys == [*state, "age"] and made.out_keys == [*state, *flags]
+    assert made.in_keys == [*state, "age", "age_fingerprint"]
+    assert made.out_keys == [*state, *flags]
     goals = ["achieved_goal", ("next", "achieved_goal")]
     goals += ["desired_goal", ("next", "desired_goal")]
     made = CAIACTransform(goal, reward_fn=min, keys=TransformKeys(reward="r"))
-    assert made.in_keys == [*state, *goals, ("caiac", "score"), "r"]
+    scores = [("caiac", "score"), ("caiac", "score_fingerprint")]
+    assert made.in_keys == [*state, *goals, *scores, "r"]
     assert made.out_keys == [*state, *goals, "r", *flags]
     relabel = HindsightGoal(goal, min)
     assert relabel.in_keys[:2] == [("next", "observation"), "desired_goal"]

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.transforms import HindsightGoal
-from torchrl_caiac.transforms.rewards import call_reward
+from torchrl_caiac.transforms.rewards import call_reward, recompute_reward
 
 LAYOUT = EntityLayout({"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]})
 
@@ -34,11 +36,31 @@ def distance(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
 
 def test_rewards_of_stored_integers_are_not_cut() -> None:
     td = whole_numbers()
-    out = CAIACTransform(LAYOUT, reward_fn=distance)(td)
+    out = CAIACTransform(LAYOUT, reward_fn=distance, rows="last")(td)
     gap = (out["next", "observation"] - out["desired_goal"]).abs()
     assert out["next", "reward"].dtype == torch.float32
     torch.testing.assert_close(out["next", "reward"][4:], -gap[4:])
     assert (out["next", "reward"][:4] == -1.0).all()
+
+
+@given(
+    chosen=st.sets(st.integers(0, 7)),
+    wide=st.booleans(),
+    dtype=st.sampled_from([torch.float32, torch.float64, torch.int64]),
+)
+def test_rewards_of_any_rows(chosen: set[int], wide: bool, dtype: torch.dtype) -> None:
+    td = whole_numbers()
+    stored = torch.arange(-8, 0).to(dtype)
+    td["next", "reward"] = stored.unsqueeze(-1) if wide else stored
+    rows = torch.tensor(sorted(chosen), dtype=torch.int64)
+    new = recompute_reward(td, LAYOUT, distance, rows)
+    assert new.shape == td["next", "reward"].shape
+    assert new.dtype == (dtype if dtype.is_floating_point else torch.float32)
+    for row in range(8):
+        wanted = float(stored[row])
+        if row in chosen:
+            wanted = -abs(float(td["next", "observation"][row]) - 1.0)
+        assert float(new[row]) == pytest.approx(wanted)
 
 
 def test_goals_between_integers_are_not_cut() -> None:
