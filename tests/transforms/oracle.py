@@ -18,6 +18,7 @@ from torchrl.data import (
     LazyTensorStorage,
     ReplayBuffer,
     SliceSampler,
+    TensorStorage,
 )
 
 from torchrl_caiac import EntityLayout
@@ -315,3 +316,33 @@ def check_samples(case: Case, check: Callable[..., Any]) -> None:
     assert_same(case.rb.storage[:], before)
     if others is not None:
         assert_same(case.donors.storage[:], others)
+
+
+def small(
+    layout: EntityLayout = FLAT,
+    storage: type[TensorStorage] = LazyTensorStorage,
+    window: int = 1,
+    batch: int = 8,
+    size: int = 20,
+    free: bool = True,
+    **kwargs: Any,
+) -> ReplayBuffer:
+    """A buffer of two trajectories of ten rows, all of them free of influence."""
+    generator = torch.Generator().manual_seed(0)
+    data = make_data(
+        layout,
+        torch.arange(20),
+        [10, 10],
+        generator,
+        goals=layout is not FLAT_FREE,
+    )
+    if free:
+        data["caiac", "score"].zero_()
+    rb = ReplayBuffer(
+        storage=storage(size),
+        sampler=slices(window),
+        batch_size=batch * window,
+        **kwargs,
+    )
+    rb.extend(data)
+    return rb
