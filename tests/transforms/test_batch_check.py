@@ -98,11 +98,37 @@ def test_a_score_is_used_only_for_its_own_state(
     }[change]
     value[place] = new
     transform = CAIACTransform(layout)
-    if torch.equal(old, new):
+    if torch.equal(old.view(torch.int32), new.view(torch.int32)):
         transform(td)
     else:
         with pytest.raises(ValueError, match=f"1 of 8 rows have scores.*{OTHERS}"):
             transform(td)
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.float32, torch.float64, torch.int64]
+)
+@pytest.mark.parametrize("where", [(), ("next",)])
+def test_changes_of_several_values_are_found(
+    dtype: torch.dtype, where: tuple[str, ...]
+) -> None:
+    """Such as the signs of a quaternion, which all change together."""
+    generator = torch.Generator().manual_seed(0)
+    data = make_data(FLAT, torch.arange(1, 21), [20], generator, dtype)
+    rb = ReplayBuffer(storage=LazyTensorStorage(20))
+    rb.extend(data)
+    score(rb, FLAT, KEY)
+    for change in ("sign", "double", "add"):
+        # Every set of columns, each in a row of its own.
+        sets = torch.arange(1, 256).view(-1, 1) >> torch.arange(8) & 1
+        td = rb.storage[:][torch.full((255,), 3)].clone()
+        value = td[(*where, "observation")]
+        new = {"sign": -value, "double": 2 * value, "add": value + 1}[change]
+        td[(*where, "observation")] = torch.where(sets.bool(), new, value)
+        transform = CAIACTransform(FLAT, unscored="keep")
+        transform(td)
+        missed = 255 - transform.unscored_count
+        assert missed == 0, f"{missed} changes of kind {change} are not found"
 
 
 @pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from tests.transforms.oracle import FLAT, N, small
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms import (
     CAIACTransform,
@@ -210,3 +211,74 @@ def test_hindsight_goals_come_after_the_augmentation(
     expected = f"append {transform.__name__} first, HindsightGoal after it"
     with pytest.raises(RuntimeError, match=expected):
         made(relabel(td))
+
+
+# --- which rows become counterfactual ------------------------------------------------
+
+
+@pytest.mark.parametrize("window", [1, 3])
+@pytest.mark.parametrize("ratio", [0.0, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize("rows", ["random", "last"])
+def test_share_of_counterfactuals(window: int, ratio: float, rows: str) -> None:
+    rb = small(window=window, batch=7)
+    rb.append_transform(CAIACTransform(FLAT, 0.05, ratio, rows=rows, window=window))
+    count = round(ratio * 7)
+    for _ in range(5):
+        batch = rb.sample()
+        marked = batch["caiac", "counterfactual"].view(7, window)
+        assert marked.sum() == count * window
+        assert (marked.all(1) == marked.any(1)).all()  # windows stay whole
+        # There is always a donor here, so that every chosen window is swapped.
+        swapped = batch["caiac", "swapped"][:, 1:]
+        assert torch.equal(swapped, marked.view(-1, 1).expand(-1, 2))
+        if rows == "last":
+            assert marked[7 - count :].all()
+
+
+@pytest.mark.parametrize("window", [1, 2])
+@pytest.mark.parametrize("donor", [False, True])
+def test_each_window_is_as_likely_to_be_counterfactual(window: int, donor) -> None:
+    transform = CAIACTransform(
+        FLAT,
+        0.05,
+        0.3,
+        window=window,
+        donors=small() if donor else None,
+        generator=torch.Generator().manual_seed(0),
+    )
+    batches, total = 3000, 8  # of which two are chosen
+    scores = torch.zeros(total * window, N)
+    pairs = torch.zeros(total, total)
+    for _ in range(batches):
+        chosen = transform.generate_parameters(scores).windows
+        assert chosen.dtype == torch.int64 and chosen[0] < chosen[1]
+        pairs[chosen[0], chosen[1]] += 1
+    # All 28 pairs are drawn as often as each other.
+    expected = batches / 28
+    counts = pairs[torch.ones(total, total).triu(1).bool()]
+    assert ((counts - expected) ** 2 / expected).sum() < 55.5  # 27 degrees, p = 0.001
+
+
+def test_the_share_of_swapped_rows_is_the_same_wherever_they_are() -> None:
+    td = small(batch=20).sample()
+    for ratio in (0.3, 1.0):
+        counts = []
+        for rows in ("random", "last"):
+            out = CAIACTransform(FLAT, counterfactual_ratio=ratio, rows=rows)(td)
+            counts.append(out["caiac", "swapped"].sum(0).tolist())
+        assert counts[0] == counts[1] == [0, round(20 * ratio), round(20 * ratio)]
+
+
+def test_chosen_rows_are_drawn_by_the_generator_alone() -> None:
+    td = small(batch=50).sample()
+    transform = CAIACTransform(FLAT)
+    transform.set_generator(torch.Generator().manual_seed(1))
+    torch.manual_seed(0)
+    one, state = transform(td), torch.get_rng_state()
+    torch.manual_seed(0)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(5)
+    transform.set_generator(torch.Generator().manual_seed(1))
+    assert (transform(td) == one).all()
+    marked = [transform(td)["caiac", "counterfactual"] for _ in range(2)]
+    assert not torch.equal(*marked)

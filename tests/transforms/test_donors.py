@@ -17,9 +17,14 @@ from tests.transforms.oracle import (
     STRIDE,
     N,
     leaf,
+    make_data,
+    score,
     small,
+    stored,
+    write_later,
 )
 from torchrl_caiac import EntityLayout
+from torchrl_caiac._torchrl import storage_data
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 from torchrl_caiac.transforms import CAIACTransform, WindowGoal
 from torchrl_caiac.transforms import donors as module
@@ -264,3 +269,119 @@ def test_donors_are_not_read_where_nothing_is_swapped() -> None:
     donors.extend(small().storage[:].exclude("desired_goal"))
     out = CAIACTransform(FLAT, donors=donors, counterfactual_ratio=0.0)(td)
     assert not out["caiac", "counterfactual"].any()
+
+
+# --- donor buffers of any form -------------------------------------------------------
+
+# Rows of two environments that wrote in turn, each one trajectory.
+IN_TURN = torch.stack([torch.arange(10), 10 + torch.arange(10)], 1).flatten()
+
+
+def donors_of(form: str, layout: EntityLayout = FLAT, capacity: int = 20):
+    """The donors of :func:`small`, in another order, in two dimensions, or with ids."""
+    data = small(layout).storage[:]
+    if form == "parallel":
+        rb = ReplayBuffer(storage=LazyTensorStorage(capacity, ndim=2))
+        rb.extend(data.view(2, 10))
+        return rb
+    if form == "interleaved":
+        data = data[IN_TURN]
+    elif form == "collector ids":
+        data["collector", "traj_ids"] = data.pop("episode")
+    rb = ReplayBuffer(storage=LazyTensorStorage(capacity))
+    rb.extend(data)
+    return rb
+
+
+FORMS = ["in order", "interleaved", "parallel", "collector ids"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+@pytest.mark.parametrize("window", [1, 3])
+@pytest.mark.parametrize("capacity", [20, 24])
+@pytest.mark.parametrize("has_fingerprints", [False, True])
+def test_donor_windows_and_their_goals_in_any_order(
+    form: str, layout: EntityLayout, window: int, capacity: int, has_fingerprints: bool
+) -> None:
+    donors = donors_of(form, layout, capacity)
+    if has_fingerprints:
+        score(donors, layout, ("caiac", "score"))
+    goals = WindowGoal(layout, window, mixture={"last": 1.0})
+    transform = CAIACTransform(
+        layout,
+        counterfactual_ratio=1.0,
+        window=window,
+        donors=donors,
+        goals=goals,
+        generator=torch.Generator().manual_seed(0),
+    )
+    batch = small(layout, window=window, batch=60).sample()
+    out = transform(batch)
+    assert out["caiac", "swapped"][:, 1:].all()
+    cup = out["observation"][:, 5] if layout is FLAT else out["state", "cup", "pos"]
+    names = (cup.reshape(60, window, -1)[..., 0] // STRIDE).long()
+    # Whole windows of one trajectory in the order of time, all of them.
+    steps = names[:, :1] + torch.arange(window)
+    assert torch.equal(names, steps)
+    assert (names // 10 == names[:, :1] // 10).all()
+    starts = [s for s in range(20) if s % 10 <= 10 - window]
+    assert set(names[:, 0].tolist()) == set(starts)
+    # The goal is the last state of the donor's trajectory, that after row 9 or 19.
+    goal = out["desired_goal"][:, 2] if layout is FLAT else out["goal", "cup"][:, 0]
+    last = 10 * (names // 10 + 1).flatten()
+    assert torch.equal((goal // STRIDE).long(), last)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("window", [1, 2])
+def test_donors_with_the_score_of_another_state_never_donate(
+    form: str, window: int
+) -> None:
+    donors = donors_of(form)
+    score(donors, FLAT, ("caiac", "score"))
+    changed = {3, 10, 19}
+    data = stored(donors)
+    for place in range(20):  # behind the storage's back
+        if int(data["row"][place]) in changed:
+            data["observation"][place, 3] += 1  # nobody's column
+    rest = set(range(20)) - changed
+    transform = CAIACTransform(
+        FLAT, counterfactual_ratio=1.0, window=window, donors=donors
+    )
+    batch = small(window=window, batch=200).sample()
+    out = transform(batch)
+    assert out["caiac", "swapped"][:, 1:].all()
+    names = (out["observation"][:, 5] // STRIDE).long()
+    if window == 1:
+        assert set(names.tolist()) == rest
+    else:
+        starts = {s for s in rest if s + 1 in rest and s % 10 < 9}
+        assert set(names[::2].tolist()) == starts
+
+
+def test_donors_written_later_donate_once_they_are_scored() -> None:
+    donors = donors_of("in order", capacity=30)
+    score(donors, FLAT, ("caiac", "score"))
+    transform = CAIACTransform(FLAT, counterfactual_ratio=1.0, donors=donors)
+    batch = small(batch=400).sample()
+
+    def donated() -> set[int]:
+        return set((transform(batch)["observation"][:, 5] // STRIDE).int().tolist())
+
+    assert donated() == set(range(20))
+    later = make_data(FLAT, 30 + torch.arange(5), [5], torch.Generator().manual_seed(0))
+    write_later(donors, later, ("caiac", "score"), with_leaves=True)
+    assert donated() == set(range(20))
+    score(donors, FLAT, ("caiac", "score"))
+    assert donated() == {*range(20), *range(30, 35)}
+
+
+def test_no_donor_has_a_score_of_its_state() -> None:
+    donors = donors_of("in order")
+    score(donors, FLAT, ("caiac", "score"))
+    storage_data(donors.storage)["next", "observation"].add_(1)
+    transform = CAIACTransform(FLAT, counterfactual_ratio=1.0, donors=donors)
+    out = transform(small(batch=4).sample())
+    assert not out["caiac", "swapped"].any()
+    assert transform.no_donor_count.tolist() == [0, 4, 4]
