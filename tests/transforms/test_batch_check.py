@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -20,7 +19,6 @@ from torchrl.data import (
 )
 from torchrl.envs.transforms import DoubleToFloat
 
-from tests.pretend_cuda import nothing_waits
 from tests.transforms.oracle import (
     FLAT,
     NESTED,
@@ -373,11 +371,24 @@ FAULTS = "do not follow each other|crosses a trajectory's end"
     noise=st.sampled_from([0.0, 0.2]),
     ids=st.sampled_from(["episode", "wide", "collector", "flags alone"]),
 )
+@pytest.mark.parametrize("nested", [False, True])
 def test_windows_are_successive_rows(
-    starts: list[int], window: int, fault: str, place: int, noise: float, ids: str
+    starts: list[int],
+    window: int,
+    fault: str,
+    place: int,
+    noise: float,
+    ids: str,
+    nested: bool,
 ) -> None:
-    lengths = [13, 13]
-    td = flat_rows(lengths, noise)
+    td = flat_rows([13, 13], noise)
+    if nested:
+        for where in (td, td["next"]):
+            state = where.pop("observation")
+            where["arm"] = state[:, 0]
+            where["cup"] = TensorDict(
+                {"x": state[:, 1:2], "y": state[:, 2:].reshape(26, 2, 1)}, [26]
+            )
     if ids == "wide":
         td["episode"] = td["episode"].unsqueeze(-1)
     elif ids != "episode":
@@ -396,7 +407,8 @@ def test_windows_are_successive_rows(
     elif fault == "other trajectory":
         wrong[step:] = [row + 13 for row in wrong[step:]]
     batch = td[torch.tensor(windows).flatten()]
-    transform = CAIACTransform(WALK, window=window)
+    layout = EntityLayout.from_keys({"arm": "arm", "cup": "cup"}) if nested else WALK
+    transform = CAIACTransform(layout, window=window)
     if fault == "none":
         assert transform(batch)["caiac", "counterfactual"].any() == (len(starts) > 1)
     else:
@@ -560,48 +572,3 @@ def test_late_errors_of_scores() -> None:
     with pytest.raises(ValueError, match=r"\['fingerprints'\] were invalid in an earl"):
         transform(good)
     transform(good)
-
-
-# --- on a GPU ------------------------------------------------------------------------
-
-
-@pytest.fixture
-def on_cuda() -> Iterator[TensorDict]:
-    """Scored rows of two trajectories of ten rows."""
-    yield scored().storage[:].to("cuda")
-
-
-@pytest.mark.gpu
-def test_errors_come_late_on_the_gpu(on_cuda: TensorDict) -> None:
-    transform = CAIACTransform(FLAT)
-    bad = on_cuda.clone()
-    bad["observation"][5, 3] = math.nan
-    transform(on_cuda)
-    with nothing_waits():
-        transform(bad)
-    torch.cuda.synchronize()
-    with pytest.raises(ValueError, match=r"observation.* in an earlier batch"):
-        transform(on_cuda)
-    transform(on_cuda)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("window", [1, 2])
-@pytest.mark.parametrize("unscored", ["raise", "keep"])
-def test_fingerprints_are_compared_on_the_gpu(
-    on_cuda: TensorDict, window: int, unscored: Any
-) -> None:
-    transform = CAIACTransform(FLAT, 0.05, 1.0, window=window, unscored=unscored)
-    other = on_cuda.clone()
-    other["observation"][4, 1] += 0.5
-    transform(on_cuda)
-    with nothing_waits():
-        out = transform(other)
-    torch.cuda.synchronize()
-    if unscored == "keep":
-        assert transform.unscored_count == 1
-        assert not out["caiac", "swapped"][4].cpu().any()
-        transform(on_cuda)
-    else:
-        with pytest.raises(ValueError, match=r"\['fingerprints'\] were invalid"):
-            transform(on_cuda)

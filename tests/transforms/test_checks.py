@@ -287,3 +287,39 @@ def test_donors_of_the_host_serve_a_gpu(
     assert all(leaf.is_cuda for leaf in found[1].values(True, True))
     assert found[0]["caiac", "swapped"].any()
     assert (found[1].cpu() == found[0]).all()
+
+
+@pytest.mark.gpu
+def test_errors_come_late_on_the_gpu() -> None:
+    transform = CAIACTransform(FLAT)
+    good = rows(FLAT)[:8].to("cuda")
+    bad = good.clone()
+    bad["observation"][5, 3] = math.nan
+    transform(good)
+    with nothing_waits():
+        transform(bad)
+    torch.cuda.synchronize()
+    with pytest.raises(ValueError, match=r"observation.* in an earlier batch"):
+        transform(good)
+    transform(good)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("window", [1, 2])
+@pytest.mark.parametrize("unscored", ["raise", "keep"])
+def test_fingerprints_are_compared_on_the_gpu(window: int, unscored: Any) -> None:
+    transform = CAIACTransform(FLAT, 0.05, 1.0, window=window, unscored=unscored)
+    good = rows(FLAT)[:8].to("cuda")
+    other = good.clone()
+    other["observation"][4, 1] += 0.01
+    transform(good)
+    with nothing_waits():
+        out = transform(other)
+    torch.cuda.synchronize()
+    if unscored == "keep":
+        assert transform.unscored_count == 1
+        assert not out["caiac", "swapped"][4].cpu().any()
+        transform(good)
+    else:
+        with pytest.raises(ValueError, match=r"\['fingerprints'\] were invalid"):
+            transform(good)

@@ -468,6 +468,36 @@ def test_her_replay_buffer_that_relabels_nothing() -> None:
 # --- what it composes with -----------------------------------------------------------
 
 
+@pytest.mark.parametrize("form", ["in two dimensions", "in turn"])
+def test_rows_of_parallel_environments(form: str) -> None:
+    data = make([3, 7, 6, 4])
+    goals = HindsightGoal(FLAT, reward, future=1.0, strategy="uniform")
+    ndim = 2 if form == "in two dimensions" else 1
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(20, ndim=ndim), sample_unit=goals, batch_size=100
+    )
+    if ndim == 2:
+        rb.extend(data.view(2, 10))
+    else:
+        rb.extend(data.view(2, 10).transpose(0, 1).reshape(-1))
+    caiac = CAIACTransform(FLAT, THRESHOLD, 0.3)
+    rb.append_transform(caiac)
+    rb.append_transform(goals)
+    case = Case(rb, goals, [3, 7, 6, 4], caiac)
+    seen = set()
+    rb.set_rng(torch.Generator().manual_seed(0))
+    goals.set_generator(torch.Generator().manual_seed(1))
+    for _ in range(15):
+        batch = rb.sample()
+        raw = data[batch["row"]]
+        check_batch(case, batch, raw)
+        real = ~batch["caiac", "counterfactual"][:, 0]
+        assert batch["hindsight", "relabeled"][real].all()
+        later = (vectors(batch)[:, 0] - 1) / STRIDE - 1 - batch["row"]
+        seen |= set(later[real].tolist())
+    assert seen == {0, 1, 2, 3, 4, 5, 6}
+
+
 @pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
 @pytest.mark.parametrize("layout", [FLAT, NESTED])
 def test_reading_a_full_storage_changes_nothing_in_it(layout, storage) -> None:
