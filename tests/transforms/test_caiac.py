@@ -162,6 +162,8 @@ def cases(draw: st.DrawFn) -> Case:
     ratio = draw(st.sampled_from([0.0, 0.3, 0.5, 0.9, 1.0]))
     swap_prob = draw(st.sampled_from([0.0, 0.5, 1.0]))
     chosen = draw(st.sampled_from(["random", "last"]))
+    # A storage may be given as well.
+    source = donors.storage if donors is not None and draw(st.booleans()) else donors
     transform = CAIACTransform(
         layout,
         threshold=THRESHOLD,
@@ -169,7 +171,7 @@ def cases(draw: st.DrawFn) -> Case:
         rows=chosen,
         swap_prob=swap_prob,
         window=window,
-        donors=donors,
+        donors=source,
         unscored="keep" if kind == "written later" else "raise",
         generator=generator,
     )

@@ -181,13 +181,15 @@ def cases(draw: st.DrawFn) -> Case:
     ratio = draw(st.sampled_from([0.0, 0.3, 0.5, 1.0]))
     swap_prob = draw(st.sampled_from([0.0, 0.5, 1.0]))
     chosen = draw(st.sampled_from(["random", "last"]))
+    # A storage may be given as well.
+    source = donors.storage if donors is not None and draw(st.booleans()) else donors
     transform = CoDATransform(
         layout,
         THRESHOLD,
         ratio,
         rows=chosen,
         window=window,
-        donors=donors,
+        donors=source,
         swap_prob=swap_prob,
         unscored="keep" if kind == "written later" else "raise",
         generator=generator,
