@@ -259,6 +259,15 @@ def test_each_window_is_as_likely_to_be_counterfactual(window: int, donor) -> No
     assert ((counts - expected) ** 2 / expected).sum() < 55.5  # 27 degrees, p = 0.001
 
 
+def test_a_single_window_may_be_any() -> None:
+    transform = CAIACTransform(FLAT, counterfactual_ratio=0.1)
+    transform.set_generator(torch.Generator().manual_seed(0))
+    td, counts = small(batch=8).sample(), torch.zeros(8)
+    for _ in range(800):
+        counts += transform(td)["caiac", "counterfactual"][:, 0]
+    assert counts.sum() == 800 and (counts - 100).abs().max() < 5 * 100**0.5
+
+
 def test_the_share_of_swapped_rows_is_the_same_wherever_they_are() -> None:
     td = small(batch=20).sample()
     for ratio in (0.3, 1.0):

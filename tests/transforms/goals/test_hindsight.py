@@ -446,18 +446,27 @@ def test_with_her_replay_buffer(swap_prob: float) -> None:
         her_case(0.75, swap_prob=swap_prob, rows="last").rb.sample()
 
 
+HER_NEEDS_LAST = (
+    "HERReplayBuffer relabels the first rows.*rows='last' to CAIACTransform.*"
+    "at most 1 - counterfactual_ratio"
+)
+
+
+def test_her_replay_buffer_needs_the_last_rows() -> None:
+    with pytest.raises(RuntimeError, match=HER_NEEDS_LAST):
+        her_case(0.25).rb.sample()
+
+
 @pytest.mark.parametrize("first", ["sample", "call"])
-def test_her_replay_buffer_needs_the_last_rows(first: str) -> None:
-    message = (
-        "HERReplayBuffer relabels the first rows.*rows='last' to CAIACTransform.*"
-        "at most 1 - counterfactual_ratio"
-    )
+def test_her_replay_buffer_is_refused_at_every_sample(first: str) -> None:
     case = her_case(0.25)
-    if first == "call":  # on data of no buffer, to see what it does
-        case.caiac(make([8]))
-    for _ in range(2):  # the first sample, and every other one
-        with pytest.raises(RuntimeError, match=message):
+    if first == "sample":
+        with pytest.raises(RuntimeError, match=HER_NEEDS_LAST):
             case.rb.sample()
+    else:  # on data of no buffer, to see what it does
+        case.caiac(make([8]))
+    with pytest.raises(RuntimeError, match=HER_NEEDS_LAST):
+        case.rb.sample()
 
 
 def test_her_replay_buffer_that_relabels_nothing() -> None:
