@@ -447,6 +447,17 @@ def test_things_that_rest_are_no_repeated_rows() -> None:
     CAIACTransform(WALK, window=3)(td)
 
 
+def test_repeated_rows_are_refused_even_if_they_are_slow() -> None:
+    td = flat_rows([12])
+    steps = torch.tensor([0.01] * 6 + [1.0] * 6).view(12, 1).expand(12, 4)
+    after = steps.cumsum(0)
+    td["observation"], td["next", "observation"] = after - steps, after
+    transform = CAIACTransform(WALK, window=2)
+    transform(td[[0, 1, 8, 9]])
+    with pytest.raises(ValueError, match="window 1 of 2 rows do not follow each other"):
+        transform(td[[8, 9, 2, 2]])
+
+
 def test_padding_of_a_sampler_is_refused() -> None:
     rb = ReplayBuffer(
         storage=LazyTensorStorage(20),
