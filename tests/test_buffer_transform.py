@@ -7,7 +7,6 @@ from torchrl.envs import TransformedEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
-from torchrl_caiac.influence import MarkUnscored
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
 
 LAYOUT = EntityLayout({"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]})
@@ -20,7 +19,6 @@ LAYOUT = EntityLayout({"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]})
         CoDATransform(LAYOUT),
         HindsightGoal(LAYOUT, max),
         WindowGoal(LAYOUT, 2),
-        MarkUnscored("score", (1,)),
     ],
     ids=lambda transform: type(transform).__name__,
 )

@@ -19,6 +19,7 @@ __all__ = [
     "rows_with_fingerprints",
     "settings_of",
     "state_hash",
+    "state_leaves",
 ]
 
 # The upper half of a fingerprint less the hash of its states; settings are the lower.
@@ -47,16 +48,18 @@ def fingerprint_key(score_key: NestedKey) -> NestedKey:
     return join(*parents, f"{name}_fingerprint")
 
 
-def state_hash(td: TensorDictBase, keys: Sequence[NestedKey]) -> torch.Tensor | None:
+def state_hash(
+    td: TensorDictBase, keys: Sequence[NestedKey], rows: slice | None = None
+) -> torch.Tensor | None:
     """Returns a hash of the bits of a state.
 
     A change of a single value always changes the hash. A change of several values is
-    missed with a probability of about 2**-40, or of 2**-10 if all of them are small
-    multiples of a power of two.
+    missed with a probability of at most 2**-32.
 
     Args:
         td (TensorDictBase): the states, ``[B]``.
         keys (sequence of NestedKey): their entries.
+        rows (slice, optional): the rows to hash. Defaults to all of them.
 
     Returns:
         torch.Tensor, optional: int64 ``[B]``; ``None`` if no entry is there.
@@ -72,8 +75,8 @@ def state_hash(td: TensorDictBase, keys: Sequence[NestedKey]) -> torch.Tensor | 
         False
     """
     total: torch.Tensor | None = None
-    for number, leaf in enumerate(_leaves(td, keys)):
-        lanes = _lanes(leaf)
+    for number, leaf in enumerate(state_leaves(td, keys)):
+        lanes = _lanes(leaf if rows is None else leaf[rows])
         weights = _weights(lanes.shape[1], number, 1, lanes.device)
         if lanes.device.type == "cpu":
             found = torch.mv(lanes, weights)
@@ -130,7 +133,7 @@ def matches(
     """
     left: torch.Tensor = known
     for names, factor in ((keys, 1), (next_keys, _NEXT)):
-        for number, leaf in enumerate(_leaves(td, names)):
+        for number, leaf in enumerate(state_leaves(td, names)):
             lanes = _lanes(leaf)
             weights = _weights(lanes.shape[1], number, factor, lanes.device)
             if lanes.device.type == "cpu":
@@ -165,7 +168,7 @@ def rows_with_fingerprints(
     """Returns which rows of a storage still have the states of their fingerprints.
 
     Args:
-        td (TensorDictBase): the rows, ``[T]``.
+        td (TensorDictBase): the rows, at least ``T``.
         known (torch.Tensor): the fingerprints, int64 ``[T]``.
         keys (sequence of NestedKey): the entries of states.
         next_keys (sequence of NestedKey): the entries of next states.
@@ -178,9 +181,8 @@ def rows_with_fingerprints(
     """
     found = torch.zeros(len(known), dtype=torch.bool, device=known.device)
     for start in range(0, len(known), batch_size):
-        part = td[start : start + batch_size]
-        rows = slice(start, start + len(part))
-        found[rows] = matches(part, known[rows], keys, next_keys)
+        rows = slice(start, min(start + batch_size, len(known)))
+        found[rows] = matches(td[rows], known[rows], keys, next_keys)
     return found
 
 
@@ -190,7 +192,9 @@ def _joint(state: torch.Tensor, after: torch.Tensor | None) -> torch.Tensor:
     return torch.add(state, after, alpha=_signed(_NEXT))
 
 
-def _leaves(td: TensorDictBase, keys: Sequence[NestedKey]) -> Iterator[torch.Tensor]:
+def state_leaves(
+    td: TensorDictBase, keys: Sequence[NestedKey]
+) -> Iterator[torch.Tensor]:
     """Yields the tensors of a state, always in the same order."""
     for key in keys:
         value = td.get(key, None)
@@ -205,22 +209,18 @@ def _leaves(td: TensorDictBase, keys: Sequence[NestedKey]) -> Iterator[torch.Ten
 
 
 def _lanes(leaf: torch.Tensor) -> torch.Tensor:
-    """Returns the bits of a leaf ``[B, ...]`` as int64 ``[B, L]``."""
+    """Returns the bits of a leaf ``[B, ...]`` as int64 ``[B, L]``.
+
+    The bits of a value are in the lower halves of lanes, so that a change of the upper
+    ones, such as that of the sign, reaches half of the bits of the hash.
+    """
     flat = leaf if leaf.ndim == 2 else leaf.reshape(len(leaf), -1)
     if flat.is_complex():
         flat = torch.view_as_real(flat).flatten(1)
     if flat.is_floating_point():
-        size = flat.dtype.itemsize
-        flat = flat.contiguous()
-        if size == 2:
-            return flat.view(torch.int16).long()
-        if size == 4 and flat.shape[1] % 2:
-            flat = torch.nn.functional.pad(flat, (0, 1))
-        if size == 8:
-            # The upper half of a value has its leading bits. Moved to a lower half,
-            # they reach more bits of the hash.
-            flat = flat.view(torch.int32).roll(-1, 1)
-        return flat.view(torch.int64)
+        if flat.stride(-1) != 1:
+            flat = flat.clone(memory_format=torch.contiguous_format)
+        flat = flat.view(torch.int16 if flat.dtype.itemsize == 2 else torch.int32)
     return flat.long()
 
 

@@ -214,9 +214,10 @@ def sampling_buffer() -> ReplayBuffer | None:
     """
     frame = sys._getframe(1)
     while frame is not None:
-        if frame.f_code is ReplayBuffer._sample.__code__:
-            buffer: ReplayBuffer = frame.f_locals["self"]
-            return buffer
+        if frame.f_code.co_name == "_sample":
+            buffer = frame.f_locals.get("self")
+            if isinstance(buffer, ReplayBuffer):
+                return buffer
         frame = frame.f_back  # type: ignore[assignment]
     return None
 

@@ -26,7 +26,7 @@ from torchrl.data import (
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 
-EPISODES, LENGTH, WINDOW = 6, 15, 10
+EPISODES, LENGTH, WINDOW = 8, 15, 10
 ROWS = EPISODES * LENGTH
 NAMES = ("arm", "cup", "box")
 
@@ -183,6 +183,7 @@ def stored(
     goals: Any = None,
 ) -> ReplayBuffer:
     """Creates a buffer of some episodes."""
+    folder.mkdir(parents=True, exist_ok=True)
     rows = transitions(case.layout, episodes)
     count = len(rows)
     arguments: dict[str, Any] = {"batch_size": batch_size, "prefetch": case.prefetch}

@@ -16,6 +16,7 @@ from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer
 
 from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
 from torchrl_caiac.transforms.checks import LateCheck
 
@@ -85,22 +86,31 @@ class EqualWindows(RandomSampler):
         return (episode * LENGTH + start + steps).flatten(), {}
 
 
+class Uninfluenced:
+    """Scores every state with zeros, so that rows have fingerprints."""
+
+    def __init__(self, layout: EntityLayout, shape: tuple[int, ...]) -> None:
+        self.layout, self.shape = layout, shape
+
+    def __call__(self, td: TensorDict) -> torch.Tensor:
+        return torch.zeros(len(td), *self.shape)
+
+
 def rows(layout: EntityLayout) -> TensorDict:
     generator = torch.Generator().manual_seed(0)
     total = EPISODES * LENGTH
-    state = torch.rand(total, 5, generator=generator)
+    walk = torch.rand(EPISODES, LENGTH + 1, 5, generator=generator)
+    state, after = walk[:, :-1].reshape(total, 5), walk[:, 1:].reshape(total, 5)
     goal = torch.rand(total, 3, generator=generator)
     td = TensorDict(
         {
             "action": torch.rand(total, 2, generator=generator),
             "episode": torch.arange(total) // LENGTH,
             "next": {"reward": -torch.ones(total, 1)},
-            ("caiac", "score"): torch.zeros(total, 3),
-            ("coda", "graph"): torch.zeros(total, 4, 3),
         },
         [total],
     )
-    for where, now in (((), state), (("next",), state + 1)):
+    for where, now in (((), state), (("next",), after)):
         if layout.is_flat:
             td[(*where, "observation")] = now
             td[(*where, "achieved_goal")] = now[:, [2, 4, 1]]
@@ -114,7 +124,11 @@ def rows(layout: EntityLayout) -> TensorDict:
     else:
         td["g", "cup", "x"], td["g", "cup", "y"] = goal[:, 2:], goal[:, 0]
         td["g", "box"] = goal[:, 1:2]
-    return td
+    rb = ReplayBuffer(storage=LazyTensorStorage(total))
+    rb.extend(td)
+    for key, shape in ((("caiac", "score"), (3,)), (("coda", "graph"), (4, 3))):
+        score_buffer(rb, Uninfluenced(layout, shape), key=key, progress=False)
+    return rb.storage[:].clone()
 
 
 def reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
@@ -188,38 +202,6 @@ def late(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("late")
-@pytest.mark.parametrize("key", ["observation", ("next", "observation")])
-def test_a_late_error_names_the_leaf(key: Any) -> None:
-    transform = CAIACTransform(FLAT)
-    good = rows(FLAT)[:8]
-    bad = good.clone()
-    bad[key][5, 3] = math.inf
-    transform(good)
-    transform(bad)
-    with pytest.raises(ValueError, match=r"observation.* in an earlier batch"):
-        transform(good)
-    transform(good)  # what was told is over
-    transform(good)
-    transform(bad)
-    with pytest.raises(ValueError, match=r"observation.*first in row 5 of the batch"):
-        transform(bad)  # wrong as well, and so the rows are known
-
-
-@pytest.mark.usefixtures("late")
-def test_late_errors_of_scores_and_windows() -> None:
-    transform = CAIACTransform(FLAT)
-    unscored = rows(FLAT)[:8]
-    unscored["caiac", "score"][2] = math.nan
-    transform(unscored)
-    with pytest.raises(ValueError, match="not scored, in 1 of 8 rows"):
-        transform(unscored)
-    transform = CAIACTransform(FLAT, window=4)
-    transform(rows(FLAT)[8:16])
-    with pytest.raises(ValueError, match=r"\['the windows'\] were invalid"):
-        transform(rows(FLAT)[:8])
-
-
-@pytest.mark.usefixtures("late")
 def test_window_goals_tell_late_that_rows_are_no_windows() -> None:
     rb = buffer(FLAT, CAIACTransform, WINDOW, "batch", goals=True)
     goals = rb._transform[0]
@@ -246,6 +228,31 @@ def test_no_sample_waits_on_the_gpu(
     assert any(batch["caiac", "swapped"].any() for batch in batches)
     leaves = batches[0].values(include_nested=True, leaves_only=True)
     assert all(leaf.is_cuda for leaf in leaves)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", [CAIACTransform, CoDATransform])
+@pytest.mark.parametrize("window", [1, WINDOW])
+@pytest.mark.parametrize("chosen", ["random", "last"])
+def test_rows_without_scores_are_kept_on_the_gpu_without_waiting(
+    kind: type, window: int, chosen: str
+) -> None:
+    rb = buffer(
+        FLAT, kind, window, "batch", False, "cuda", unscored="keep", rows=chosen
+    )
+    data = rb.storage[:]
+    data["caiac", "score"][::3] = math.nan
+    data["coda", "graph"][::3] = math.nan
+    rb.sample()
+    with nothing_waits():
+        batches = [rb.sample() for _ in range(3)]
+    key = ("caiac", "score") if kind is CAIACTransform else ("coda", "graph")
+    for batch in batches:
+        wrong = batch[key].flatten(1).isnan().any(1).view(-1, window).any(1)
+        swapped = batch["caiac", "swapped"].any(1).view(-1, window).any(1)
+        assert not (wrong & swapped).cpu().any()
+    count = [int(batch[key].flatten(1).isnan().any(1).sum()) for batch in batches]
+    assert rb._transform[0].unscored_count >= sum(count) > 0
 
 
 @pytest.mark.gpu
@@ -295,3 +302,24 @@ def test_errors_come_late_on_the_gpu() -> None:
     with pytest.raises(ValueError, match=r"observation.* in an earlier batch"):
         transform(good)
     transform(good)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("window", [1, 2])
+@pytest.mark.parametrize("unscored", ["raise", "keep"])
+def test_fingerprints_are_compared_on_the_gpu(window: int, unscored: Any) -> None:
+    transform = CAIACTransform(FLAT, 0.05, 1.0, window=window, unscored=unscored)
+    good = rows(FLAT)[:8].to("cuda")
+    other = good.clone()
+    other["observation"][4, 1] += 0.01
+    transform(good)
+    with nothing_waits():
+        out = transform(other)
+    torch.cuda.synchronize()
+    if unscored == "keep":
+        assert transform.unscored_count == 1
+        assert not out["caiac", "swapped"][4].cpu().any()
+        transform(good)
+    else:
+        with pytest.raises(ValueError, match=r"\['fingerprints'\] were invalid"):
+            transform(good)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -12,21 +11,26 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import (
-    LazyMemmapStorage,
-    LazyTensorStorage,
-    ReplayBuffer,
-    SliceSampler,
-)
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from tests.transforms.test_caiac import (
+from tests.transforms.oracle import (
+    DONORS,
     FLAT,
     FLAT_FREE,
+    FORMS,
+    KINDS,
     NESTED,
     STRIDE,
+    Case,
+    check_samples,
+    chosen_windows,
+    draw_buffer,
     make_data,
     owner_of,
-    time_order,
+    score,
+    slices,
+    stored,
+    time_windows,
 )
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac._torchrl import add_revision, storage_data
@@ -60,56 +64,43 @@ def free_components(layout: EntityLayout, graphs: torch.Tensor) -> list[frozense
     return [frozenset(g) for g in groups if not g & never]
 
 
-def donor_windows(
-    rb: ReplayBuffer, layout: EntityLayout, window: int
-) -> dict[frozenset[int], set[Window]]:
+def donor_windows(case: Case) -> dict[frozenset[int], set[Window]]:
     """The row names of all windows that have each component, one by one."""
-    order, data, found = time_order(rb), rb.storage[:], {}
-    for start in range(len(order) - window + 1):
-        part = order[start : start + window]
-        if len({int(data["episode"][i]) for i in part}) == 1:
-            for component in free_components(layout, data["coda", "graph"][part]):
-                names = tuple(int(data["row"][i]) for i in part)
+    data, found = stored(case.donors), {}
+    for part in time_windows(case.donors, case.window):
+        names = tuple(data["row"][part].tolist())
+        if not case.stale & set(names):
+            graphs = data["coda", "graph"][part]
+            for component in free_components(case.layout, graphs):
                 found.setdefault(component, set()).add(names)
     return found
 
 
-@dataclass
-class Case:
-    layout: EntityLayout
-    rb: ReplayBuffer
-    donors: ReplayBuffer | None
-    window: int
-    ratio: float
-    swap_prob: float
-    transform: CoDATransform
-
-
 def origins(
-    case: Case, batch: TensorDict, stored: TensorDict, windows: int
+    case: Case, batch: TensorDict, rows: TensorDict, windows: int
 ) -> dict[tuple[int, int], set[Window]]:
     """Which windows the values of each entity come from, its own in the first place."""
     found: dict[tuple[int, int], set[Window]] = {}
-    for key in stored.keys(True, True):
+    for key in rows.keys(True, True):
         path = key if isinstance(key, tuple) else (key,)
-        value, real = batch[key], stored[key]
+        value, real = batch[key], rows[key]
         assert value.dtype == real.dtype and value.shape == real.shape
         owner = owner_of(case.layout, path)
         if owner is None:
-            assert torch.equal(value, real), key
+            torch.testing.assert_close(value, real, rtol=0, atol=0, equal_nan=True)
             continue
         value, real = (x.reshape(len(x), -1).double() for x in (value, real))
         if path[0] == "next":
-            value, real = -value - 1, -real - 1
+            value, real = value - STRIDE, real - STRIDE
         assert torch.equal(value % STRIDE, real % STRIDE), key  # of the same column
-        rows = (value // STRIDE).long().unflatten(0, (windows, case.window))
+        names = (value // STRIDE).long().unflatten(0, (windows, case.window))
         for column in range(value.shape[1]):
             name = owner if isinstance(owner, str) else owner[column]
             if name is None:
                 assert torch.equal(value[:, column], real[:, column])
                 continue
             for b in range(windows):
-                origin = tuple(rows[b, :, column].tolist())
+                origin = tuple(names[b, :, column].tolist())
                 found.setdefault((b, case.layout.index(name)), set()).add(origin)
     return found
 
@@ -118,27 +109,26 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> None:
     """Raises where the batch is anything that section 3's invariants forbid."""
     layout, window = case.layout, case.window
     windows = len(batch) // window
-    first = windows - round(case.ratio * windows)
-    raw = case.rb.storage[:]
+    chosen = chosen_windows(case, batch)
+    raw = stored(case.rb)
     place = {int(row): i for i, row in enumerate(raw["row"])}
-    stored = raw[torch.tensor([place[row] for row in batch["row"].tolist()])]
+    rows = raw[torch.tensor([place[row] for row in batch["row"].tolist()])]
     names = [tuple(part) for part in batch["row"].unflatten(0, (-1, window)).tolist()]
-    graphs = stored["coda", "graph"].unflatten(0, (windows, window))
-    free = [free_components(layout, part) for part in graphs]
-    marked = batch["caiac", "counterfactual"].reshape(windows, window)
-    assert marked.tolist() == [[b >= first] * window for b in range(windows)]
+    graphs = rows["coda", "graph"].unflatten(0, (windows, window))
+    free = [
+        [] if case.stale & set(own) else free_components(layout, part)
+        for own, part in zip(names, graphs, strict=True)
+    ]
     marks = batch["caiac", "swapped"].unflatten(0, (windows, window))
     assert marks.shape == (windows, window, N)
     assert torch.equal(marks, marks[:, :1].expand_as(marks))
-    found = origins(case, batch, stored, windows)
-    allowed = (
-        None if case.donors is None else donor_windows(case.donors, layout, window)
-    )
+    found = origins(case, batch, rows, windows)
+    allowed = None if case.donors is None else donor_windows(case)
     for b in range(windows):
         swapped = {n for n in range(N) if marks[b, 0, n]}
         for n in set(range(N)) - swapped:
             assert found.get((b, n), {names[b]}) == {names[b]}
-        if b < first:
+        if not chosen[b]:
             assert not swapped
             continue
         for component in free[b]:
@@ -163,9 +153,6 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> None:
         assert not swapped
 
 
-lengths = st.lists(st.integers(1, 9), min_size=1, max_size=4)
-
-
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
     window = draw(st.integers(1, 4))
@@ -173,70 +160,50 @@ def cases(draw: st.DrawFn) -> Case:
     dtype = draw(st.sampled_from([torch.float32, torch.float64, torch.int64]))
     generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
     share = draw(st.sampled_from([0.0, 0.05, 0.3]))
+    kind = draw(st.sampled_from(KINDS))
+    stale: set[int] = set()
 
-    def buffer(offset: int, **kwargs: Any) -> ReplayBuffer:
-        parts = [*draw(lengths), draw(st.integers(window, window + 4))]
-        rows = offset + torch.arange(sum(parts))
-        goals = layout is not FLAT_FREE
-        data = make_data(layout, rows, parts, generator, dtype, goals)
-        data = with_graphs(data, share, generator)
-        # a storage smaller than the data is a ring that was written past its end
-        least = max(window, sum(parts) // 2)
-        size = draw(st.integers(least, sum(parts) + 2))
-        storage = draw(st.sampled_from([LazyTensorStorage, LazyMemmapStorage]))
-        rb = ReplayBuffer(storage=storage(size), **kwargs)
-        for begin in range(0, len(data), least):
-            rb.extend(data[begin : begin + least])
-        return rb
+    def buffer(first: int, form: str, **kwargs: Any) -> ReplayBuffer:
+        def data(*args: Any) -> TensorDict:
+            made = make_data(layout, *args, generator, dtype, layout is not FLAT_FREE)
+            return with_graphs(made, share, generator)
+
+        key = ("coda", "graph")
+        return draw_buffer(
+            draw, data, layout, key, first, form, window, kind, stale, **kwargs
+        )
 
     batch = draw(st.integers(1, 8))
-    rb = buffer(
-        0,
-        batch_size=batch * window,
-        sampler=None
-        if window == 1
-        else SliceSampler(slice_len=window, traj_key="episode"),
-    )
+    rb = buffer(0, "in order", batch_size=batch * window, sampler=slices(window))
     rb.set_rng(generator)  # a failure can be repeated
-    donors = buffer(STRIDE, batch_size=1) if draw(st.booleans()) else None
+    form = draw(st.sampled_from(FORMS))
+    donors = None if form is None else buffer(DONORS, form, batch_size=1)
     ratio = draw(st.sampled_from([0.0, 0.3, 0.5, 1.0]))
     swap_prob = draw(st.sampled_from([0.0, 0.5, 1.0]))
+    chosen = draw(st.sampled_from(["random", "last"]))
+    # A storage may be given as well.
+    source = donors.storage if donors is not None and draw(st.booleans()) else donors
     transform = CoDATransform(
         layout,
         THRESHOLD,
         ratio,
+        rows=chosen,
         window=window,
-        donors=donors,
+        donors=source,
         swap_prob=swap_prob,
+        unscored="keep" if kind == "written later" else "raise",
         generator=generator,
     )
-    return Case(layout, rb, donors, window, ratio, swap_prob, transform)
+    return Case(layout, rb, transform, donors, window, ratio, swap_prob, chosen, stale)
 
 
 @settings(
-    max_examples=60,
-    deadline=None,
+    max_examples=80,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(case=cases())
 def test_invariants(case: Case) -> None:
-    order, data = time_order(case.rb), case.rb.storage[:]
-    if not any(
-        len(set(data["episode"][order[s : s + case.window]].tolist())) == 1
-        for s in range(len(order) - case.window + 1)
-    ):
-        return  # the ring left no trajectory as long as the window
-    before = data.clone()
-    others = None if case.donors is None else case.donors.storage[:].clone()
-    case.rb.append_transform(case.transform)
-    missing = [0] * N
-    for _ in range(2):
-        check_batch(case, case.rb.sample(), missing)
-    if case.swap_prob == 1.0:
-        assert case.transform.no_donor_count.tolist() == missing
-    assert (case.rb.storage[:] == before).all()
-    if case.donors is not None:
-        assert (case.donors.storage[:] == others).all()
+    check_samples(case, check_batch)
 
 
 # --- small fixed data ----------------------------------------------------------------
@@ -248,11 +215,10 @@ def small(
     generator = torch.Generator().manual_seed(0)
     rows = torch.arange(20)
     data = make_data(layout, rows, [10, 10], generator, goals=layout is not FLAT_FREE)
-    sampler = (
-        None if window == 1 else SliceSampler(slice_len=window, traj_key="episode")
-    )
     rb = ReplayBuffer(
-        storage=LazyTensorStorage(20), sampler=sampler, batch_size=batch * window
+        storage=LazyTensorStorage(20),
+        sampler=slices(window),
+        batch_size=batch * window,
     )
     rb.extend(with_graphs(data, share, generator))
     return rb
@@ -289,10 +255,15 @@ def test_without_links_it_is_caiac() -> None:
     td = rb.sample()
     td["coda", "graph"][:, N] = torch.rand(50, N)
     td["action score"] = td["coda", "graph"][:, N]
-    coda = CoDATransform(FLAT_FREE, 0.4)(td)
-    caiac = CAIACTransform(FLAT_FREE, 0.4, score_key="action score")(td)
-    for key in ("counterfactual", "swapped"):
-        assert torch.equal(coda["caiac", key], caiac["caiac", key])
+    for rows in ("random", "last"):
+        coda = CoDATransform(FLAT_FREE, 0.4, rows=rows)
+        caiac = CAIACTransform(FLAT_FREE, 0.4, score_key="action score", rows=rows)
+        found = []
+        for transform in (coda, caiac):
+            transform.set_generator(torch.Generator().manual_seed(6))
+            found.append(transform(td))
+        for key in ("counterfactual", "swapped"):
+            assert torch.equal(found[0]["caiac", key], found[1]["caiac", key])
 
 
 def test_nested_keys_and_options() -> None:
@@ -306,10 +277,13 @@ def test_nested_keys_and_options() -> None:
     )
     assert transform.graph_key == ("my", "own", "graph")
     out = transform(td)
-    assert out["marks", "row"].sum() == 4 and out["swaps"][4:, 1:].all()
-    swapped = out["next", "got", "cup"][4:].sum(-1, keepdim=True)
-    assert torch.equal(out["next", "reward"][4:], swapped)
-    assert torch.equal(out["next", "reward"][:4], td["next", "reward"][:4])
+    marked = out["marks", "row"]
+    assert marked.sum() == 4
+    assert torch.equal(out["swaps"][:, 1:], marked.expand(-1, 2))
+    gained = out["next", "got", "cup"].sum(-1, keepdim=True)
+    assert torch.equal(
+        out["next", "reward"], torch.where(marked, gained, td["next", "reward"])
+    )
     assert ("caiac", "swapped") not in out.keys(True, True)
     assert "threshold=0.2" in repr(transform) and "CoDATransform" in repr(transform)
 
@@ -355,23 +329,31 @@ def test_with_hindsight_goals() -> None:
     for transform in (coda, goals):
         rb.append_transform(transform)
     batch = rb.sample()
-    assert batch["caiac", "swapped"][4:, 1:].all()
-    assert (
-        batch["hindsight", "relabeled"].flatten().tolist() == [False] * 4 + [True] * 4
-    )
-    achieved = batch["next", "observation"][4:, [7, 1, 2]]  # as `achieved` names them
-    wanted = batch["desired_goal"][4:, [1, 2, 0]]
+    marked = batch["caiac", "counterfactual"]
+    assert marked.sum() == 4
+    assert torch.equal(batch["caiac", "swapped"][:, 1:], marked.expand(-1, 2))
+    assert torch.equal(batch["hindsight", "relabeled"], marked)
+    chosen = marked[:, 0]
+    # As `achieved` names them.
+    achieved = batch["next", "observation"][chosen][:, [7, 1, 2]]
+    wanted = batch["desired_goal"][chosen][:, [1, 2, 0]]
     for goal in wanted:
         assert (achieved == goal).all(-1).any()
 
 
 def test_rows_written_later_are_not_scored() -> None:
     rb = small()
+    score(rb, FLAT, ("coda", "graph"))
     rb.append_transform(CoDATransform(FLAT, 1.0))
-    rb.extend(rb.storage[:3].clone().exclude(("coda", "graph")))
-    assert int(rb.storage[:]["coda", "graph"].isnan().flatten(1).all(1).sum()) == 3
-    with pytest.raises(ValueError, match=r"'graph'\) is NaN, that is not scored, in 3"):
+    rb[:]
+    names = 30 + torch.arange(3)
+    later = make_data(FLAT, names, [3], torch.Generator().manual_seed(0))
+    rb.extend(later.exclude(("caiac", "score")))
+    message = r"3 of 20 rows have graphs in \('coda', 'graph'\) of other states than"
+    with pytest.raises(ValueError, match=message):
         rb[:]
+    score(rb, FLAT, ("coda", "graph"))
+    rb[:]
 
 
 def test_the_index_of_donors_follows_writes() -> None:
@@ -425,7 +407,7 @@ def test_at_most_64_entities() -> None:
         },
         [4],
     )
-    out = CoDATransform(layout)(td)
+    out = CoDATransform(layout, rows="last")(td)
     swapped = out["caiac", "swapped"]
     assert swapped[2:].sum(1).tolist() == [63, 63] and not swapped[:, 5].any()
     assert torch.equal(out["observation"][:, 0], out["observation"][:, 63])

@@ -22,6 +22,7 @@ from torchrl_caiac.transforms.components import (
     draw_batch_components,
     draw_buffer_components,
 )
+from torchrl_caiac.transforms.draws import draw_windows
 
 THRESHOLD = 0.3
 
@@ -118,6 +119,7 @@ def test_a_link_of_any_direction_and_step_counts() -> None:
     share=st.floats(0.0, 1.0),
     swap_prob=st.sampled_from([0.0, 0.5, 1.0]),
     window=st.integers(1, 3),
+    rows=st.sampled_from(["random", "last"]),
     seed=st.integers(0, 2**31),
 )
 def test_batch_donors_have_the_same_component(
@@ -127,6 +129,7 @@ def test_batch_donors_have_the_same_component(
     share: float,
     swap_prob: float,
     window: int,
+    rows: str,
     seed: int,
 ) -> None:
     generator = torch.Generator().manual_seed(seed)
@@ -135,13 +138,25 @@ def test_batch_donors_have_the_same_component(
     which = torch.randint(3, (windows,), generator=generator)
     masks = components(kinds[which], THRESHOLD)
     count = round(share * windows)
+    chosen, given_windows = list(range(windows - count, windows)), None
+    if rows == "random":
+        given_windows = draw_windows(
+            windows, count, device=masks.device, generator=generator
+        )
+        chosen = given_windows.tolist()
     draw = draw_batch_components(
-        masks, count, window=window, swap_prob=swap_prob, generator=generator
+        masks,
+        count,
+        window=window,
+        swap_prob=swap_prob,
+        windows=given_windows,
+        generator=generator,
     )
+    assert draw.windows is given_windows
     assert draw.donors.shape == draw.swapped.shape == (count, entities)
     found, missing = sets(masks), [0] * entities
     for c in range(count):
-        own = windows - count + c
+        own = chosen[c]
         for i, component in enumerate(found[own]):
             donors = [
                 b for b in range(windows) if b != own and found[b][i] == component

@@ -13,6 +13,7 @@ from torchrl_caiac.transforms.donors import eligible_starts
 from torchrl_caiac.transforms.draws import (
     draw_batch_donors,
     draw_buffer_donors,
+    draw_windows,
     uninfluenced,
 )
 
@@ -46,18 +47,33 @@ def test_uninfluenced(rows, window: int, dtype: torch.dtype) -> None:
     window=st.integers(1, 3),
     share=st.floats(0, 1),
     swap_prob=st.sampled_from([0.0, 0.4, 1.0]),
+    rows=st.sampled_from(["random", "last"]),
 )
-def test_batch_donors(seed, windows, window, share, swap_prob) -> None:
+def test_batch_donors(seed, windows, window, share, swap_prob, rows) -> None:
     generator = torch.Generator().manual_seed(seed)
     free = torch.rand(windows, 3, generator=generator) < 0.5
     count = round(share * windows)
+    chosen, given_windows = list(range(windows - count, windows)), None
+    if rows == "random":
+        given_windows = draw_windows(
+            windows, count, device=free.device, generator=generator
+        )
+        chosen = given_windows.tolist()
+        assert chosen == sorted(set(chosen)) and len(chosen) == count
+        assert set(chosen) <= set(range(windows))
     draw = draw_batch_donors(
-        free, count, window=window, swap_prob=swap_prob, generator=generator
+        free,
+        count,
+        window=window,
+        swap_prob=swap_prob,
+        windows=given_windows,
+        generator=generator,
     )
+    assert draw.windows is given_windows
     assert draw.donors.shape == draw.swapped.shape == (count, 3)
     for c in range(count):
         for n in range(3):
-            own = windows - count + c
+            own = chosen[c]
             options = [b for b in range(windows) if free[b, n] and b != own]
             if draw.swapped[c, n]:
                 assert free[own, n] and int(draw.donors[c, n]) % window == 0
@@ -66,8 +82,35 @@ def test_batch_donors(seed, windows, window, share, swap_prob) -> None:
                 assert not (free[own, n] and options)
             assert 0 <= int(draw.donors[c, n]) < windows * window
     if swap_prob == 1.0:
-        alone = free[windows - count :].sum(0) * (free.sum(0) == 1)
+        alone = free[chosen].sum(0) * (free.sum(0) == 1)
         assert draw.no_donor.tolist() == alone.tolist()
+
+
+def test_donors_of_given_windows_are_the_other_ones() -> None:
+    free = torch.ones(5, 1, dtype=torch.bool)
+    generator = torch.Generator().manual_seed(0)
+    windows = torch.tensor([0, 3])
+    counts = torch.zeros(2, 5)
+    for _ in range(4000):
+        draw = draw_batch_donors(free, 2, windows=windows, generator=generator)
+        counts[[0, 1], draw.donors[:, 0]] += 1
+    assert counts[0, 0] == counts[1, 3] == 0
+    assert (counts[counts > 0] - 1000).abs().max() < 5 * 750**0.5
+
+
+def test_drawn_windows_are_all_or_none() -> None:
+    device = torch.device("cpu")
+    assert draw_windows(5, 5, device=device).tolist() == list(range(5))
+    assert draw_windows(5, 0, device=device).shape == (0,)
+    draws = {
+        tuple(
+            draw_windows(
+                20, 5, device=device, generator=torch.Generator().manual_seed(seed)
+            ).tolist()
+        )
+        for seed in (0, 0, 1)
+    }
+    assert len(draws) == 2
 
 
 def test_buffer_donors_are_uniform() -> None:

@@ -41,7 +41,7 @@ def distance(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
 
 def test_rewards_of_stored_integers_are_not_cut() -> None:
     td = whole_numbers()
-    out = CAIACTransform(LAYOUT, reward_fn=distance)(td)
+    out = CAIACTransform(LAYOUT, reward_fn=distance, rows="last")(td)
     gap = (out["next", "observation"] - out["desired_goal"]).abs()
     assert out["next", "reward"].dtype == torch.float32
     torch.testing.assert_close(out["next", "reward"][4:], -gap[4:])

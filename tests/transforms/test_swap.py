@@ -6,9 +6,13 @@ import pickle
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from tensordict import LazyStackedTensorDict, TensorClass, TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_caiac import CAIACTransform, EntityLayout
+from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms.draws import SwapDraw
 from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
 
@@ -143,18 +147,38 @@ def test_old_plans_are_dropped() -> None:
     assert len(pickle.dumps(planner)) < 10_000
 
 
-@pytest.mark.parametrize("wraps", [False, True])
-def test_donor_windows_of_a_ring(wraps: bool) -> None:
-    """A donor window that starts at the last row goes on at the first."""
+@pytest.mark.parametrize(
+    ("ids", "newest", "start", "rows"),
+    [
+        ([0, 0, 0, 1, 1], None, 3, [3, 4]),
+        ([0, 1, 1, 1, 0], 0, 4, [4, 0]),  # a ring goes on at its first row
+        ([0, 1, 0, 1, 1], None, 1, [1, 3]),  # of two environments in turn
+    ],
+)
+@pytest.mark.parametrize("chosen", [None, [0], [1]])
+def test_rows_of_donor_windows(
+    ids: list[int],
+    newest: int | None,
+    start: int,
+    rows: list[int],
+    chosen: list[int] | None,
+) -> None:
     td = flat(4)
     plan, values = SwapPlanner(FLAT)(td)
-    rows = 5  # of 6 in the storage
+    rb = ReplayBuffer(storage=LazyTensorStorage(5 if newest is not None else 6))
+    order = torch.tensor(ids)
+    if newest is not None:  # write the row that is replaced first
+        order = torch.cat([torch.tensor([9]), order[1:], order[:1]])
+    for number in order:
+        rb.extend(TensorDict({"episode": number.view(1)}, [1]))
     source = 100 + torch.arange(24.0).view(6, 4)
     draw = SwapDraw(
-        donors=torch.tensor([[0, 4 if wraps else 3]]),
+        donors=torch.tensor([[0, start]]),
         swapped=torch.tensor([[False, True]]),
         no_donor=torch.tensor([0, 0]),
+        windows=None if chosen is None else torch.tensor(chosen),
     )
+    trajectories = trajectory_index(rb, done_key=None)
     out = apply_swap(
         td,
         plan,
@@ -162,12 +186,57 @@ def test_donor_windows_of_a_ring(wraps: bool) -> None:
         draw,
         window=2,
         sources=[source, -source],
-        num_source_rows=rows,
+        trajectories=trajectories,
     )
     expected = td["observation"].clone()
-    expected[2:, 1:3] = source[[4, 0] if wraps else [3, 4], 1:3]
+    first = 2 * chosen[0] if chosen else 2 if chosen is None else 0
+    expected[first : first + 2, 1:3] = source[rows, 1:3]
     assert torch.equal(out["observation"], expected)
     assert torch.equal(out["next", "observation"], -expected)
+
+
+@given(
+    windows=st.integers(1, 6),
+    window=st.integers(1, 3),
+    seed=st.integers(0, 2**31),
+    data=st.data(),
+)
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+def test_any_windows_of_a_batch_are_replaced(
+    layout: EntityLayout, windows: int, window: int, seed: int, data: st.DataObject
+) -> None:
+    rows = windows * window
+    td = flat(rows) if layout is FLAT else nested(rows)
+    name = torch.arange(float(rows))
+    for key in td.keys(True, True):
+        shape = td[key].shape
+        sign = -1 if key[0] == "next" else 1
+        td[key] = sign * name.view(-1, *(1,) * (len(shape) - 1)).expand(shape).clone()
+    before = td.clone()
+    chosen = sorted(data.draw(st.sets(st.integers(0, windows - 1))))
+    generator = torch.Generator().manual_seed(seed)
+    shape = (len(chosen), 2)
+    draw = SwapDraw(
+        donors=torch.randint(windows, shape, generator=generator) * window,
+        swapped=torch.rand(shape, generator=generator) < 0.5,
+        no_donor=torch.zeros(2, dtype=torch.int64),
+        windows=torch.tensor(chosen, dtype=torch.int64),
+    )
+    draw.swapped[:, 0] = False  # the arm is fixed
+    plan, values = SwapPlanner(layout)(td)
+    out = apply_swap(td, plan, values, draw, window=window)
+    cup = name.clone()
+    for c, b in enumerate(chosen):
+        if draw.swapped[c, 1]:
+            start = int(draw.donors[c, 1])
+            cup[b * window : (b + 1) * window] = name[start : start + window]
+    for leaf in plan.leaves:
+        sign = -1 if leaf.key[0] == "next" else 1
+        value = sign * out[leaf.key].reshape(rows, -1)
+        for column in range(value.shape[1]):
+            of_cup = layout is NESTED or column in (1, 2)
+            assert torch.equal(value[:, column], cup if of_cup else name)
+    assert (td == before).all()
 
 
 def test_places_in_storages_of_more_than_two_billion_values() -> None:

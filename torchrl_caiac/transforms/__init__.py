@@ -6,6 +6,7 @@ from torchrl_caiac.transforms.caiac import CAIACTransform
 from torchrl_caiac.transforms.coda import CoDATransform
 from torchrl_caiac.transforms.goals import HindsightGoal, WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.real_transitions import real_transitions
 
 __all__ = [
     "CAIACTransform",
@@ -13,4 +14,5 @@ __all__ = [
     "HindsightGoal",
     "TransformKeys",
     "WindowGoal",
+    "real_transitions",
 ]

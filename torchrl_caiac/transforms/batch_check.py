@@ -15,6 +15,7 @@ from torchrl_caiac._fingerprints import (
     is_fingerprint_of,
     matches,
     state_hash,
+    state_leaves,
 )
 from torchrl_caiac._keys import missing_key
 from torchrl_caiac.entities import EntityLayout
@@ -27,6 +28,9 @@ __all__ = ["BatchCheck", "CheckedScores"]
 # The mean distance of a state from the next state of the row before it, in the largest
 # steps of the batch, up to which both may be recordings of one state.
 _NOISE = 0.5
+# The share of states that differ from the next state before them from which on both are
+# taken for separate recordings.
+_MOST = 0.5
 
 
 class CheckedScores(NamedTuple):
@@ -106,13 +110,11 @@ class BatchCheck:
             if known is not None:
                 is_valid = matches(td, known, self.layout.in_keys, self._next_keys)
         else:
-            state = state_hash(td, self.layout.in_keys)
-            after = state_hash(td, self._next_keys)
             crosses = self._crossings(td)
-            if state is not None and after is not None:
-                crosses = crosses | self._gaps(td, state, after)
-                if known is not None:
-                    is_valid = is_fingerprint_of(known, state, after)
+            is_valid = self._follows(td, known)
+            if is_valid is None:
+                gaps, is_valid = self._gaps(td, known)
+                crosses = crosses | gaps
         if not LateCheck.needed(scores.device) and crosses is not None:
             if bool(crosses.any()):
                 self._explain_windows(td, crosses)
@@ -240,11 +242,13 @@ class BatchCheck:
             if ids is None:
                 ids = td.get(COLLECTOR_KEY, None)
             if ids is not None:
+                _check_size(ids, self.keys.trajectory, td)
                 ids = ids.reshape(-1, self.window)
                 found = ids[:, 1:] != ids[:, :-1]
         if self.keys.done is not None:
             done = td.get(self.keys.done, None)
             if done is not None:
+                _check_size(done, self.keys.done, td)
                 ended = done.reshape(-1, self.window)[:, :-1].bool()
                 found = ended if found is None else found | ended
         if found is None:
@@ -257,18 +261,54 @@ class BatchCheck:
             )
         return found
 
+    def _follows(
+        self, td: TensorDictBase, known: torch.Tensor | None
+    ) -> torch.Tensor | None:
+        """Returns all true, bool ``[B]``, if states are the next states before them.
+
+        The fast way, for the usual case; ``None`` if another way has to decide, among
+        them whenever a fingerprint does not fit.
+        """
+        keys, window = self.layout.in_keys, self.window
+        pairs = list(
+            zip(state_leaves(td, keys), state_leaves(td, self._next_keys), strict=False)
+        )
+        if not pairs or LateCheck.needed(pairs[0][0].device):
+            return None
+        for here, there in pairs:
+            if here.shape != there.shape or not torch.equal(
+                here.unflatten(0, (-1, window))[:, 1:],
+                there.unflatten(0, (-1, window))[:, :-1],
+            ):
+                return None
+        if known is None:
+            return pairs[0][0].new_ones(len(td), dtype=torch.bool)
+        state = state_hash(td, keys)
+        last = state_hash(td, self._next_keys, slice(window - 1, None, window))
+        assert state is not None and last is not None  # there are leaves
+        after = torch.cat([state.view(-1, window)[:, 1:], last.unsqueeze(1)], 1)
+        is_valid = is_fingerprint_of(known, state, after.flatten())
+        return is_valid if bool(is_valid.all()) else None
+
     def _gaps(
-        self, td: TensorDictBase, state: torch.Tensor, after: torch.Tensor
-    ) -> torch.Tensor:
-        """Returns where a row is not the one after the row before it.
+        self, td: TensorDictBase, known: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Finds where a row is not the one after the row before it.
 
         A row follows another one if its state is the other's next state. Both may be
-        separate, noisy recordings, so states that differ are compared by distance.
+        separate, noisy recordings: where most of them differ, they are compared by
+        distance.
+
+        Returns:
+            tuple of torch.Tensor: bool ``[B, window - 1]``; and bool ``[B * window]``,
+            the rows with the states of their fingerprints.
         """
+        state = state_hash(td, self.layout.in_keys)
+        after = state_hash(td, self._next_keys)
+        assert state is not None and after is not None  # the planner found the leaves
+        is_valid = None if known is None else is_fingerprint_of(known, state, after)
         state, after = state.view(-1, self.window), after.view(-1, self.window)
         differs = state[:, 1:] != after[:, :-1]
-        if not LateCheck.needed(state.device) and not bool(differs.any()):
-            return differs
         # A sampler that pads windows repeats rows.
         repeats = (state[:, 1:] == state[:, :-1]) & (after[:, 1:] == after[:, :-1])
         here = self.layout.read(td).double()
@@ -277,8 +317,9 @@ class BatchCheck:
         size = largest.clamp_min(1e-6 * here.abs().amax(0)).clamp_min(1e-12)
         here = here.view(-1, self.window, here.shape[-1])[:, 1:]
         there = there.view(-1, self.window, there.shape[-1])[:, :-1]
-        distance = ((here - there).abs() / size).mean(-1)
-        return differs & (repeats | ~(distance <= _NOISE))
+        is_near = ((here - there).abs() / size).mean(-1) <= _NOISE
+        is_noisy = is_near & (differs.double().mean() > _MOST)
+        return differs & (repeats | ~is_noisy), is_valid
 
     def _explain_windows(self, td: TensorDictBase, crosses: torch.Tensor) -> None:
         window = int(crosses.any(1).nonzero()[0, 0])
@@ -311,3 +352,11 @@ class BatchCheck:
                     f"values, first in row {row} of the batch: clean the data, or "
                     "the donors' data"
                 )
+
+
+def _check_size(leaf: torch.Tensor, key: NestedKey | None, td: TensorDictBase) -> None:
+    if leaf.numel() != len(td):
+        raise ValueError(
+            f"{key!r} has shape {list(leaf.shape)}, expected [{len(td)}] or "
+            f"[{len(td)}, 1]: one value for each row"
+        )

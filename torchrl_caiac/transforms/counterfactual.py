@@ -144,7 +144,6 @@ class CounterfactualTransform(RandomTransform, ABC):
         )
         self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
         self._unscored = torch.zeros((), dtype=torch.int64)
-        self._knows_buffer = self.chosen_rows == "last"
         swapped = self._planner.keys
         self.in_keys = [
             *swapped,
@@ -365,7 +364,7 @@ class CounterfactualTransform(RandomTransform, ABC):
                 finite, a window is not one of successive rows, or a score belongs to
                 another state.
         """
-        if not self._knows_buffer:
+        if self.chosen_rows == "random":
             self._check_buffer()
         shape = tensordict.batch_size
         if len(shape) != 1:
@@ -392,7 +391,6 @@ class CounterfactualTransform(RandomTransform, ABC):
 
     def _check_buffer(self) -> None:
         """Raises if the buffer relabels the first rows of a batch later."""
-        self._knows_buffer = True
         buffer = sampling_buffer()
         if isinstance(buffer, HERReplayBuffer) and buffer.her_ratio > 0:
             raise RuntimeError(
@@ -403,7 +401,15 @@ class CounterfactualTransform(RandomTransform, ABC):
             )
 
     def _check_shape(self, td: TensorDictBase) -> None:
-        if not td.batch_size or td.batch_size[-1] % self.window:
+        sizes = list(td.batch_size)
+        while len(sizes) > 1 and sizes[-1] == 1:  # of slices in an ensemble
+            sizes.pop()
+        if not td.numel():
+            raise ValueError(
+                f"the batch has shape {list(td.shape)}, that is no rows: sample from a "
+                "buffer that is not empty"
+            )
+        if sizes[-1] % self.window:
             raise ValueError(
                 f"the batch has shape {list(td.shape)}, whose last dimension is not a "
                 f"multiple of the window {self.window}: sample whole windows from each "

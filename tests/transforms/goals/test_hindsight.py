@@ -270,6 +270,7 @@ def settings_of_cases(draw: st.DrawFn) -> dict:
         "strategy": draw(st.sampled_from(["geometric", "uniform"])),
         "caiac": {
             "counterfactual_ratio": draw(shares),
+            "rows": draw(st.sampled_from(["random", "last"])),
             "swap_prob": draw(st.sampled_from([0.0, 0.5, 1.0])),
             "reward_fn": draw(st.sampled_from([None, reward])),
         },
@@ -356,13 +357,15 @@ def test_relabel_only_relabels_the_same_share_and_swaps_nothing() -> None:
     for key in ("observation", ("next", "observation"), "action"):
         assert torch.equal(batch[key], stored[key])
     relabeled = batch["hindsight", "relabeled"][:, 0]
-    for half in (slice(0, 2000), slice(2000, 4000)):
+    marked = batch["caiac", "counterfactual"][:, 0]
+    assert marked.sum() == 2000
+    for half in (marked, ~marked):
         assert relabeled[half].double().mean() == pytest.approx(0.5, abs=0.05)
     # counterfactual goals come from anywhere, real ones from the row's own future
     reached = (vectors(batch)[:, 0] - 1) / STRIDE - 1
     own = torch.where(batch["row"] < 40, 0, 1) == torch.where(reached < 40, 0, 1)
-    assert own[:2000][relabeled[:2000]].all()
-    assert own[2000:][relabeled[2000:]].double().mean() == pytest.approx(0.5, abs=0.06)
+    assert own[relabeled & ~marked].all()
+    assert own[relabeled & marked].double().mean() == pytest.approx(0.5, abs=0.06)
 
 
 def test_without_augmentation_the_same_share_is_random() -> None:
@@ -387,10 +390,11 @@ def test_goals_of_counterfactual_rows_follow_the_swap(layout: EntityLayout) -> N
     )
     batch = case.rb.sample()
     check_batch(case, batch, stored_rows(case.rb, batch))
-    goal = vectors(batch)[32:]
+    marked = batch["caiac", "counterfactual"][:, 0]
+    goal = vectors(batch)[marked]
     # the cup and the box of one goal come from different rows
     assert ((goal[:, 0] // STRIDE) != (goal[:, 2] // STRIDE)).any()
-    assert batch["hindsight", "relabeled"][32:].all()
+    assert batch["hindsight", "relabeled"][marked].all() and marked.sum() == 32
 
 
 def test_rewards_of_the_augmentation_are_the_same() -> None:
@@ -400,32 +404,34 @@ def test_rewards_of_the_augmentation_are_the_same() -> None:
         case.goals.expand(torch.arange(18), {}, case.rb.storage)
         augment = CAIACTransform(layout, THRESHOLD, reward_fn=reward)
         swapped = augment(raw)
-        rewards = swapped["next", "reward"][9:]
-        assert (rewards != 0.5).all()
+        marked = swapped["caiac", "counterfactual"]
+        rewards = swapped["next", "reward"]
+        assert torch.equal(rewards != 0.5, marked) and marked.sum() == 9
         out = case.goals(swapped)
-        assert torch.equal(out["next", "reward"][9:], rewards)
+        assert torch.equal(out["next", "reward"][marked], rewards[marked])
 
 
 # --- HERReplayBuffer -----------------------------------------------------------------
 
 
+def her_case(her_ratio: float, **caiac: object) -> Case:
+    return build_case(
+        [7, 4, 9],
+        batch=16,
+        kind=HERReplayBuffer,
+        rb_kwargs={
+            "her_ratio": her_ratio,
+            "achieved_goal_key": ("next", "achieved_goal"),
+        },
+        caiac=caiac,
+        data={"stale": True, "achieved": True},
+        future=0.0,
+    )
+
+
 @pytest.mark.parametrize("swap_prob", [0.0, 1.0])
 def test_with_her_replay_buffer(swap_prob: float) -> None:
-    def build(her_ratio: float) -> Case:
-        return build_case(
-            [7, 4, 9],
-            batch=16,
-            kind=HERReplayBuffer,
-            rb_kwargs={
-                "her_ratio": her_ratio,
-                "achieved_goal_key": ("next", "achieved_goal"),
-            },
-            caiac={"swap_prob": swap_prob},
-            data={"stale": True, "achieved": True},
-            future=0.0,
-        )
-
-    case = build(0.25)
+    case = her_case(0.25, swap_prob=swap_prob, rows="last")
     raw = case.rb.storage[:].clone()
     seen = 0
     for _ in range(20):
@@ -437,10 +443,69 @@ def test_with_her_replay_buffer(swap_prob: float) -> None:
     assert 50 < seen < 110
     assert (case.rb.storage[:] == raw).all()
     with pytest.raises(ValueError, match=r"first 12 rows.* 4 of which are counterfac"):
-        build(0.75).rb.sample()
+        her_case(0.75, swap_prob=swap_prob, rows="last").rb.sample()
+
+
+HER_NEEDS_LAST = (
+    "HERReplayBuffer relabels the first rows.*rows='last' to CAIACTransform.*"
+    "at most 1 - counterfactual_ratio"
+)
+
+
+def test_her_replay_buffer_needs_the_last_rows() -> None:
+    with pytest.raises(RuntimeError, match=HER_NEEDS_LAST):
+        her_case(0.25).rb.sample()
+
+
+@pytest.mark.parametrize("first", ["sample", "call"])
+def test_her_replay_buffer_is_refused_at_every_sample(first: str) -> None:
+    case = her_case(0.25)
+    if first == "sample":
+        with pytest.raises(RuntimeError, match=HER_NEEDS_LAST):
+            case.rb.sample()
+    else:  # on data of no buffer, to see what it does
+        case.caiac(make([8]))
+    with pytest.raises(RuntimeError, match=HER_NEEDS_LAST):
+        case.rb.sample()
+
+
+def test_her_replay_buffer_that_relabels_nothing() -> None:
+    batch = her_case(0.0).rb.sample()
+    assert batch["caiac", "counterfactual"].sum() == 8
 
 
 # --- what it composes with -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["in two dimensions", "in turn"])
+def test_rows_of_parallel_environments(form: str) -> None:
+    data = make([3, 7, 6, 4])
+    goals = HindsightGoal(FLAT, reward, future=1.0, strategy="uniform")
+    ndim = 2 if form == "in two dimensions" else 1
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(20, ndim=ndim), sample_unit=goals, batch_size=100
+    )
+    if ndim == 2:
+        rb.extend(data.view(2, 10))
+    else:
+        rb.extend(data.view(2, 10).transpose(0, 1).reshape(-1))
+    caiac = CAIACTransform(FLAT, THRESHOLD, 0.3)
+    rb.append_transform(caiac)
+    rb.append_transform(goals)
+    case = Case(rb, goals, [3, 7, 6, 4], caiac)
+    seen = set()
+    rb.set_rng(torch.Generator().manual_seed(0))
+    goals.set_generator(torch.Generator().manual_seed(1))
+    caiac.set_generator(torch.Generator().manual_seed(2))
+    for _ in range(30):
+        batch = rb.sample()
+        raw = data[batch["row"]]
+        check_batch(case, batch, raw)
+        real = ~batch["caiac", "counterfactual"][:, 0]
+        assert batch["hindsight", "relabeled"][real].all()
+        later = (vectors(batch)[:, 0] - 1) / STRIDE - 1 - batch["row"]
+        seen |= set(later[real].tolist())
+    assert seen == {0, 1, 2, 3, 4, 5, 6}
 
 
 @pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
@@ -526,8 +591,7 @@ def test_renamed_keys() -> None:
     td = make([8])
     td["caiac", "score"].zero_()
     out = goals(augment(td))
-    assert out["a", "b"][:, 0].tolist() == [False] * 4 + [True] * 4
-    assert out["cf"][4:].all()
+    assert torch.equal(out["a", "b"], out["cf"]) and out["cf"].sum() == 4
     with pytest.raises(RuntimeError, match="CAIACTransform first, HindsightGoal after"):
         augment(goals(td))
 

@@ -97,6 +97,37 @@ def buffer(
 # --- through a buffer ----------------------------------------------------------------
 
 
+@pytest.mark.parametrize("window", [1, 3])
+@pytest.mark.parametrize("nested", [False, True])
+def test_goals_in_a_storage_of_parallel_environments(window: int, nested: bool) -> None:
+    goals = WindowGoal(NESTED if nested else LAYOUT, window, mixture={"last": 1.0})
+    sampler = SliceSampler(slice_len=window, traj_key="episode")
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(20, ndim=2),
+        sampler=None if window == 1 else sampler,
+        sample_unit=goals,
+        batch_size=40 * window,
+    )
+    rb.extend(make([3, 7, 6, 4], nested).view(2, 10))  # two trajectories each
+    rb.append_transform(goals)
+    rb.append_transform(CAIACTransform(goals.layout, window=window, threshold=0.1))
+    seen = set()
+    for _ in range(5):
+        batch = rb.sample()
+        assert batch.batch_size == (40 * window,)
+        cup = batch["s", "cup", "x"] if nested else batch["observation"][:, 1]
+        names = ((cup - 1) / 10).long()  # where the cup is from, perhaps a donor
+        goal = batch["g", "cup", "x"] if nested else batch["desired_goal"][:, 1]
+        ends = torch.tensor([3, 10, 16, 20])
+        wanted = ends[torch.searchsorted(ends, names, right=True)]
+        assert torch.equal(((goal - 1) / 10).long(), wanted)
+        steps = names.view(-1, window)
+        assert torch.equal(steps, steps[:, :1] + torch.arange(window))
+        assert batch["caiac", "swapped"][:, 1].sum() == 20 * window
+        seen |= set(wanted.tolist())
+    assert seen == {3, 10, 16, 20}
+
+
 @settings(max_examples=40, deadline=None)
 @given(
     lengths=st.lists(st.integers(1, 9), min_size=1, max_size=4),
