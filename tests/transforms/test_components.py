@@ -137,36 +137,34 @@ def test_batch_donors_have_the_same_component(
     kinds = sparse_graphs(3, entities, links, generator)
     which = torch.randint(3, (windows,), generator=generator)
     masks = components(kinds[which], THRESHOLD)
-    count = round(share * windows)
-    chosen, given_windows = list(range(windows - count, windows)), None
+    count, chosen = round(share * windows), None
+    last = [True] * count
     if rows == "random":
-        given_windows = draw_windows(
-            windows, count, device=masks.device, generator=generator
-        )
-        chosen = given_windows.tolist()
+        chosen = draw_windows(windows, count, device=masks.device, generator=generator)
+        last, count = chosen.tolist(), windows
     draw = draw_batch_components(
         masks,
         count,
         window=window,
         swap_prob=swap_prob,
-        windows=given_windows,
+        chosen=chosen,
         generator=generator,
     )
-    assert draw.windows is given_windows
+    assert draw.chosen is chosen
     assert draw.donors.shape == draw.swapped.shape == (count, entities)
     found, missing = sets(masks), [0] * entities
     for c in range(count):
-        own = chosen[c]
+        own = windows - count + c
         for i, component in enumerate(found[own]):
             donors = [
                 b for b in range(windows) if b != own and found[b][i] == component
             ]
             swapped = bool(draw.swapped[c, i])
-            if not component or not donors or swap_prob == 0.0:
+            if not component or not donors or swap_prob == 0.0 or not last[c]:
                 assert not swapped
             elif swap_prob == 1.0:
                 assert swapped
-            missing[i] += bool(component) and not donors
+            missing[i] += last[c] and bool(component) and not donors
             if swapped:
                 assert int(draw.donors[c, i]) in [b * window for b in donors]
             for j in component:  # all of a component do the same

@@ -49,13 +49,13 @@ class FromTheFirst(CounterfactualTransform):
     def draw_in_batch(
         free: torch.Tensor, num_counterfactual: int, **settings: Any
     ) -> SwapDraw:
-        windows = settings.pop("windows")
+        chosen = settings.pop("chosen")
         assert settings == {"window": 1, "swap_prob": 1.0, "generator": None}
         tail = free[len(free) - num_counterfactual :]
-        if windows is not None:
-            tail = free[windows]
+        if chosen is not None:
+            tail = tail & chosen.unsqueeze(-1)
         donors = torch.zeros_like(tail, dtype=torch.int64)
-        return SwapDraw(donors, tail, tail.sum(0), windows=windows)
+        return SwapDraw(donors, tail, tail.sum(0), chosen=chosen)
 
 
 def batch() -> TensorDict:
@@ -252,9 +252,10 @@ def test_each_window_is_as_likely_to_be_counterfactual(window: int, donor) -> No
     scores = torch.zeros(total * window, N)
     pairs = torch.zeros(total, total)
     for _ in range(batches):
-        chosen = transform.generate_parameters(scores).windows
-        assert chosen.dtype == torch.int64 and chosen[0] < chosen[1]
-        pairs[chosen[0], chosen[1]] += 1
+        chosen = transform.generate_parameters(scores).chosen
+        assert chosen.dtype == torch.bool and chosen.shape == (total,)
+        first, second = chosen.nonzero()[:, 0]  # exactly two
+        pairs[first, second] += 1
     # All 28 pairs are drawn as often as each other.
     expected = batches / 28
     counts = pairs[torch.ones(total, total).triu(1).bool()]

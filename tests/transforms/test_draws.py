@@ -52,56 +52,57 @@ def test_uninfluenced(rows, window: int, dtype: torch.dtype) -> None:
 def test_batch_donors(seed, windows, window, share, swap_prob, rows) -> None:
     generator = torch.Generator().manual_seed(seed)
     free = torch.rand(windows, 3, generator=generator) < 0.5
-    count = round(share * windows)
-    chosen, given_windows = list(range(windows - count, windows)), None
+    count, chosen = round(share * windows), None
+    last = [True] * count
     if rows == "random":
-        given_windows = draw_windows(
-            windows, count, device=free.device, generator=generator
-        )
-        chosen = given_windows.tolist()
-        assert chosen == sorted(set(chosen)) and len(chosen) == count
-        assert set(chosen) <= set(range(windows))
+        chosen = draw_windows(windows, count, device=free.device, generator=generator)
+        assert chosen.dtype == torch.bool and chosen.shape == (windows,)
+        last, count = chosen.tolist(), windows
+        assert sum(last) == round(share * windows)
     draw = draw_batch_donors(
         free,
         count,
         window=window,
         swap_prob=swap_prob,
-        windows=given_windows,
+        chosen=chosen,
         generator=generator,
     )
-    assert draw.windows is given_windows
+    assert draw.chosen is chosen
     assert draw.donors.shape == draw.swapped.shape == (count, 3)
     for c in range(count):
+        own = windows - count + c
         for n in range(3):
-            own = chosen[c]
+            assert last[c] or not draw.swapped[c, n]
             options = [b for b in range(windows) if free[b, n] and b != own]
             if draw.swapped[c, n]:
                 assert free[own, n] and int(draw.donors[c, n]) % window == 0
                 assert int(draw.donors[c, n]) // window in options
             elif swap_prob == 1.0:
-                assert not (free[own, n] and options)
+                assert not (last[c] and free[own, n] and options)
             assert 0 <= int(draw.donors[c, n]) < windows * window
     if swap_prob == 1.0:
-        alone = free[chosen].sum(0) * (free.sum(0) == 1)
+        own_rows = free[windows - count :][torch.tensor(last, dtype=torch.bool)]
+        alone = own_rows.sum(0) * (free.sum(0) == 1)
         assert draw.no_donor.tolist() == alone.tolist()
 
 
-def test_donors_of_given_windows_are_the_other_ones() -> None:
+def test_donors_of_chosen_windows_are_the_other_ones() -> None:
     free = torch.ones(5, 1, dtype=torch.bool)
     generator = torch.Generator().manual_seed(0)
-    windows = torch.tensor([0, 3])
+    chosen = torch.tensor([True, False, False, True, False])
     counts = torch.zeros(2, 5)
     for _ in range(4000):
-        draw = draw_batch_donors(free, 2, windows=windows, generator=generator)
-        counts[[0, 1], draw.donors[:, 0]] += 1
+        draw = draw_batch_donors(free, 5, chosen=chosen, generator=generator)
+        assert torch.equal(draw.swapped[:, 0], chosen)
+        counts[[0, 1], draw.donors[chosen, 0]] += 1
     assert counts[0, 0] == counts[1, 3] == 0
     assert (counts[counts > 0] - 1000).abs().max() < 5 * 750**0.5
 
 
 def test_drawn_windows_are_all_or_none() -> None:
     device = torch.device("cpu")
-    assert draw_windows(5, 5, device=device).tolist() == list(range(5))
-    assert draw_windows(5, 0, device=device).shape == (0,)
+    assert draw_windows(5, 5, device=device).tolist() == [True] * 5
+    assert draw_windows(5, 0, device=device).tolist() == [False] * 5
     draws = {
         tuple(
             draw_windows(

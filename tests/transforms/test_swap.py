@@ -155,13 +155,13 @@ def test_old_plans_are_dropped() -> None:
         ([0, 1, 0, 1, 1], None, 1, [1, 3]),  # of two environments in turn
     ],
 )
-@pytest.mark.parametrize("chosen", [None, [0], [1]])
+@pytest.mark.parametrize("chosen", [None, 0, 1])
 def test_rows_of_donor_windows(
     ids: list[int],
     newest: int | None,
     start: int,
     rows: list[int],
-    chosen: list[int] | None,
+    chosen: int | None,
 ) -> None:
     td = flat(4)
     plan, values = SwapPlanner(FLAT)(td)
@@ -172,11 +172,12 @@ def test_rows_of_donor_windows(
     for number in order:
         rb.extend(TensorDict({"episode": number.view(1)}, [1]))
     source = 100 + torch.arange(24.0).view(6, 4)
+    is_chosen = torch.tensor([True]) if chosen is None else torch.arange(2) == chosen
     draw = SwapDraw(
-        donors=torch.tensor([[0, start]]),
-        swapped=torch.tensor([[False, True]]),
+        donors=torch.tensor([[0, start]]).expand(len(is_chosen), 2),
+        swapped=torch.stack([torch.zeros_like(is_chosen), is_chosen], -1),
         no_donor=torch.tensor([0, 0]),
-        windows=None if chosen is None else torch.tensor(chosen),
+        chosen=None if chosen is None else is_chosen,
     )
     trajectories = trajectory_index(rb, done_key=None)
     out = apply_swap(
@@ -189,7 +190,7 @@ def test_rows_of_donor_windows(
         trajectories=trajectories,
     )
     expected = td["observation"].clone()
-    first = 2 * chosen[0] if chosen else 2 if chosen is None else 0
+    first = 0 if chosen == 0 else 2
     expected[first : first + 2, 1:3] = source[rows, 1:3]
     assert torch.equal(out["observation"], expected)
     assert torch.equal(out["next", "observation"], -expected)
@@ -213,20 +214,24 @@ def test_any_windows_of_a_batch_are_replaced(
         sign = -1 if key[0] == "next" else 1
         td[key] = sign * name.view(-1, *(1,) * (len(shape) - 1)).expand(shape).clone()
     before = td.clone()
-    chosen = sorted(data.draw(st.sets(st.integers(0, windows - 1))))
+    count = data.draw(st.integers(0, windows))
+    chosen = torch.tensor(
+        data.draw(st.lists(st.booleans(), min_size=count, max_size=count)),
+        dtype=torch.bool,
+    )
     generator = torch.Generator().manual_seed(seed)
-    shape = (len(chosen), 2)
+    shape = (count, 2)
     draw = SwapDraw(
         donors=torch.randint(windows, shape, generator=generator) * window,
-        swapped=torch.rand(shape, generator=generator) < 0.5,
+        swapped=(torch.rand(shape, generator=generator) < 0.5) & chosen.unsqueeze(-1),
         no_donor=torch.zeros(2, dtype=torch.int64),
-        windows=torch.tensor(chosen, dtype=torch.int64),
+        chosen=chosen,
     )
     draw.swapped[:, 0] = False  # the arm is fixed
     plan, values = SwapPlanner(layout)(td)
     out = apply_swap(td, plan, values, draw, window=window)
     cup = name.clone()
-    for c, b in enumerate(chosen):
+    for c, b in enumerate(range(windows - count, windows)):
         if draw.swapped[c, 1]:
             start = int(draw.donors[c, 1])
             cup[b * window : (b + 1) * window] = name[start : start + window]

@@ -402,6 +402,11 @@ class CounterfactualTransform(RandomTransform, ABC):
 
     def _check_shape(self, td: TensorDictBase) -> None:
         sizes = list(td.batch_size)
+        if not sizes:
+            raise ValueError(
+                "the batch has shape [], a single transition: give a batch [B], "
+                "such as the one that a buffer samples, or td.unsqueeze(0)"
+            )
         while len(sizes) > 1 and sizes[-1] == 1:  # of slices in an ensemble
             sizes.pop()
         if not td.numel():
