@@ -76,12 +76,7 @@ def state_hash(
     """
     total: torch.Tensor | None = None
     for number, leaf in enumerate(state_leaves(td, keys)):
-        lanes = _lanes(leaf if rows is None else leaf[rows])
-        weights = _weights(lanes.shape[1], number, 1, lanes.device)
-        if lanes.device.type == "cpu":
-            found = torch.mv(lanes, weights)
-        else:  # integers have no matrix products on other devices
-            found = (lanes * weights).sum(-1)
+        found = _weighted(_lanes(leaf if rows is None else leaf[rows]), number, 1)
         total = found if total is None else total + found
     return total
 
@@ -131,15 +126,10 @@ def matches(
     Returns:
         torch.Tensor: bool ``[B]``.
     """
-    left: torch.Tensor = known
+    left = known
     for names, factor in ((keys, 1), (next_keys, _NEXT)):
         for number, leaf in enumerate(state_leaves(td, names)):
-            lanes = _lanes(leaf)
-            weights = _weights(lanes.shape[1], number, factor, lanes.device)
-            if lanes.device.type == "cpu":
-                left = torch.addmv(left, lanes, weights, alpha=-1)
-            else:
-                left = left - (lanes * weights).sum(-1)
+            left = left - _weighted(_lanes(leaf), number, factor)
     return left >> 32 == _MAGIC
 
 
@@ -222,6 +212,14 @@ def _lanes(leaf: torch.Tensor) -> torch.Tensor:
             flat = flat.clone(memory_format=torch.contiguous_format)
         flat = flat.view(torch.int16 if flat.dtype.itemsize == 2 else torch.int32)
     return flat.long()
+
+
+def _weighted(lanes: torch.Tensor, number: int, factor: int) -> torch.Tensor:
+    """Returns the sums of lanes ``[B, L]`` with random weights, int64 ``[B]``."""
+    weights = _weights(lanes.shape[1], number, factor, lanes.device)
+    if lanes.device.type == "cpu":
+        return torch.mv(lanes, weights)
+    return (lanes * weights).sum(-1)  # integers have no products on other devices
 
 
 @lru_cache(maxsize=256)

@@ -223,7 +223,7 @@ figure
 # %%
 # Counterfactuals and hindsight goals
 # -----------------------------------
-# Two transforms augment the batches. The first one makes the last half counterfactual:
+# Two transforms augment the batches. The first one makes half of them counterfactual:
 # a cube that the action does not influence is replaced by that of another row, with its
 # goal. The second one relabels (section A.5.2): half of the real rows get a goal that
 # was achieved later in their episode, and half of the counterfactual rows a goal that a

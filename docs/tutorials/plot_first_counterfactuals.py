@@ -174,7 +174,7 @@ fig.tight_layout()
 # %%
 # Counterfactual batches
 # ----------------------
-# Append the transform to the buffer, and the last half of each batch is counterfactual.
+# Append the transform to the buffer, and half of each batch is counterfactual.
 # The training loop does not change. In this half, uninfluenced pucks come from other
 # rows in which they are uninfluenced too, with their next states. What the robot
 # influences stays, and so do the actions.

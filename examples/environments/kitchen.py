@@ -230,7 +230,10 @@ class Kitchen(Environment):
         torch.manual_seed(0)
         copies = 64
         transform = CAIACTransform(
-            LAYOUT, threshold=threshold, counterfactual_ratio=copies / 512
+            LAYOUT,
+            threshold=threshold,
+            counterfactual_ratio=copies / 512,
+            rows="last",
         )
         states, titles = [], []
         for task in self.settings.frames:

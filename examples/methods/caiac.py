@@ -45,5 +45,8 @@ class CAIAC(Method):
             self.threshold,
             counterfactual_ratio,
             score_key=self.score_key,
+            # Batches are in random order: the last rows are as good as others, and the
+            # draws are those of the published runs.
+            rows="last",
             **options,
         )

@@ -40,5 +40,6 @@ class CoDA(Method):
             self.threshold,
             counterfactual_ratio,
             graph_key=self.score_key,
+            rows="last",  # as CAIAC
             **options,
         )

@@ -287,43 +287,30 @@ def _one_pass(
     progress: bool,
 ) -> bool:
     """Scores all rows without a valid score; returns whether there were none."""
-    leaves, is_first = None, True
+    found = None
     if not overwrite:
-        leaves, is_first = _existing(storage, data, index.length, layout, key, settings)
-    if leaves is None:
+        found = _existing(storage, data, index.length, layout, key, settings)
+    if found is None:
         # Score the first block before anything is written: an estimator or data that
         # do not fit leave the storage unchanged.
         feature_shape = tuple(scorer.block(0).state.shape[1:])
-        with _claimed(data):
+        stale, is_first = torch.ones(index.length, dtype=torch.bool), True
+    else:
+        leaves, is_good, is_first = found
+        if bool(is_good.all()):
+            return True
+        scorer.feature_shape = feature_shape = tuple(leaves.scores.shape[1:])
+        position = torch.arange(index.length, device=index.device)
+        stale = ~is_good[index.rows(position).cpu()]
+    with _claimed(data):
+        if found is None:
             write_record(storage, data, key, settings, layout, "new")
             leaves = new_leaves(storage, key, feature_shape)
-            write_record(storage, data, key, settings, layout, "scoring")
-            stale = torch.ones(index.length, dtype=torch.bool)
-            _score(
-                scorer, index, leaves, stale, steps, is_first=True, progress=progress
-            )
-            write_record(storage, data, key, settings, layout, "scored")
-    else:
-        scorer.feature_shape = tuple(leaves.scores.shape[1:])
-        stale = ~row_states(
-            data, leaves, layout, index.length, settings_digest(settings)
-        )[0]
-        if not bool(stale.any()):
-            return True
-        every_position = torch.arange(index.length, device=index.device)
-        stale = stale[index.rows(every_position).cpu()]
-        with _claimed(data):
-            write_record(storage, data, key, settings, layout, "scoring")
-            _score(
-                scorer,
-                index,
-                leaves,
-                stale,
-                steps,
-                is_first=is_first,
-                progress=progress,
-            )
-            write_record(storage, data, key, settings, layout, "scored")
+        write_record(storage, data, key, settings, layout, "scoring")
+        _score(
+            scorer, index, leaves, stale, steps, is_first=is_first, progress=progress
+        )
+        write_record(storage, data, key, settings, layout, "scored")
     add_revision(storage)
     return False
 
@@ -335,8 +322,8 @@ def _existing(
     layout: EntityLayout,
     key: NestedKey,
     settings: dict[str, Any],
-) -> tuple[ScoreLeaves | None, bool]:
-    """Returns leaves to keep, and whether their first pass was interrupted.
+) -> tuple[ScoreLeaves, torch.Tensor, bool] | None:
+    """Returns leaves to keep, their valid rows, and whether a pass was interrupted.
 
     Raises:
         ValueError: the scores are of another origin or have other settings.
@@ -344,18 +331,20 @@ def _existing(
     leaves = find_leaves(storage, key)
     record = read_record(storage, data, key)
     if leaves is None or (record is not None and record["state"] == "new"):
-        return None, True  # none, or interrupted before the leaves were initialized
+        return None  # none, or interrupted before the leaves were initialized
     check_shape(leaves, key, layout)
     # Leaves without scores may have been created with the first write to the buffer.
     if leaves.fingerprints is None:
         if leaves.all_nan(length):
-            return None, True
+            return None
         raise ValueError(
             f"the storage has scores in {key!r} without fingerprints of their states "
             "(by another program, or an earlier version): call "
             "score_buffer(..., overwrite=True) to replace them, or give another key"
         )
-    has_others = row_states(data, leaves, layout, length, settings_digest(settings))[1]
+    is_good, has_others = row_states(
+        data, leaves, layout, length, settings_digest(settings)
+    )
     if has_others:
         differences = "see the settings of the earlier call"
         if record is not None:
@@ -364,7 +353,7 @@ def _existing(
             f"the scores in {key!r} have other settings: {differences}. Call "
             "score_buffer(..., overwrite=True) to recompute them, or give another key"
         )
-    return leaves, record is not None and record["state"] == "scoring"
+    return leaves, is_good, record is not None and record["state"] == "scoring"
 
 
 def _score(
