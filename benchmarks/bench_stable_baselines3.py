@@ -143,7 +143,7 @@ def make_buffer(data: TensorDict) -> TensorDictReplayBuffer:
     """Creates our buffer, as the method ``caiac`` of the example does."""
     goals = HindsightGoal(LAYOUT, fetch_push_reward)
     rb = offline_buffer(data, batch_size=AT_ONCE * BATCH, sample_unit=goals)
-    rb.append_transform(CAIACTransform(LAYOUT, threshold=0.05))
+    rb.append_transform(CAIACTransform(LAYOUT, threshold=0.05, rows="last"))
     rb.append_transform(goals)
     return rb
 

@@ -17,7 +17,7 @@ LAYOUT = EntityLayout({"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]})
     [
         CAIACTransform(LAYOUT),
         CoDATransform(LAYOUT),
-        HindsightGoal(LAYOUT, max),
+        HindsightGoal(LAYOUT, lambda achieved, desired: achieved[:, 0]),
         WindowGoal(LAYOUT, 2),
     ],
     ids=lambda transform: type(transform).__name__,

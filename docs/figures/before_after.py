@@ -44,7 +44,10 @@ def counterfactual(path: Path, threshold: float) -> tuple[torch.Tensor, torch.Te
     # The last rows of a batch become counterfactual; the others are their donors.
     donors = torch.randint(len(data), (BATCH - COPIES,))
     transform = CAIACTransform(
-        LAYOUT, threshold=threshold, counterfactual_ratio=COPIES / BATCH
+        LAYOUT,
+        threshold=threshold,
+        counterfactual_ratio=COPIES / BATCH,
+        rows="last",
     )
     batch = transform(data[torch.cat([donors, row.expand(COPIES)])])
     recorded, made = data["observation"][row], batch["observation"][-COPIES:]
