@@ -254,3 +254,8 @@ def test_environments_in_a_second_dimension(content, newest, streams):
     drawn = coordinates // streams, coordinates % streams
     assert flat_rows(drawn, storage).tolist() == coordinates.tolist()
     assert flat_rows(coordinates, storage).tolist() == coordinates.tolist()
+    stacked = torch.stack(drawn, -1)
+    assert flat_rows(stacked, storage).tolist() == coordinates.tolist()
+    # 4 bytes for each row and each of three parts.
+    parts = (index.left, index.order, index.place)
+    assert {part.dtype for part in parts} == {torch.int32}

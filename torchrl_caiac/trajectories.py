@@ -219,28 +219,18 @@ def trajectory_index(
         last = ended.clone()
         last[:-1] |= ids[1:] != ids[:-1]
     ends = last.nonzero()[:, 0]
-    dtype = torch.int32 if length < 1 << 31 else torch.int64
-    pieces = None
-    if ids is not None:
-        pieces = _joined(ids[ends], ended[ends], ends, steps)
+    pieces = None if ids is None else _joined(ids[ends], ended[ends], ends, steps)
     if pieces is None and streams == 1:
-        return _index(length, oldest, ends, dtype)
+        return _index(length, oldest, ends)
     if pieces is None:
-        place = torch.arange(length, dtype=dtype, device=ends.device)
+        place = torch.arange(length, device=ends.device)
     else:
-        order, lengths, ends = pieces
-        place = _ranges(order, lengths).to(dtype)
+        starts, lengths, ends = pieces
+        place = _ranges(starts, lengths)
     # From places in the order of environment and time to rows of the storage.
-    row = place if streams == 1 else place % steps
-    row = (row + oldest) % steps
-    if streams > 1:
-        row = row * streams + torch.div(place, steps, rounding_mode="floor")
-    position = torch.empty_like(row)
-    position[row.long()] = torch.arange(length, dtype=dtype, device=row.device)
-    found = _index(length, 0, ends, dtype)
-    return TrajectoryIndex(
-        length, oldest * streams, ends, _picked(found.left, position), row, position
-    )
+    row = (place % steps + oldest) % steps * streams
+    row += torch.div(place, steps, rounding_mode="floor")
+    return _ordered(row, ends, oldest * streams)
 
 
 def flat_rows(
@@ -250,7 +240,7 @@ def flat_rows(
 
     Args:
         index (torch.Tensor or tuple of torch.Tensor): rows ``[B]``, or the coordinates
-            ``[B]`` in each dimension of the storage.
+            in each dimension of the storage, ``[B]`` each or ``[B, ndim]``.
         storage (TensorStorage): the sampled storage.
 
     Returns:
@@ -267,7 +257,9 @@ def flat_rows(
         tensor([5, 1])
     """
     if isinstance(index, torch.Tensor):
-        return index.reshape(-1)
+        if storage.ndim == 1 or index.ndim == 1:
+            return index.reshape(-1)
+        index = index.unbind(-1)
     if len(index) == 1:
         return index[0].reshape(-1)
     rows = torch.zeros_like(index[0])
@@ -343,16 +335,28 @@ def _in_time(leaf: torch.Tensor, streams: int, oldest: int) -> torch.Tensor:
     return leaf.roll(-oldest) if oldest else leaf
 
 
-def _index(
-    length: int, oldest: int, ends: torch.Tensor, dtype: torch.dtype
-) -> TrajectoryIndex:
+def _index(length: int, oldest: int, ends: torch.Tensor) -> TrajectoryIndex:
     """Returns the index of trajectories that lie one after another."""
-    left = torch.empty(length, dtype=dtype, device=ends.device)
+    left = torch.empty(length, dtype=_dtype(length), device=ends.device)
     for start in range(0, length, _CHUNK):  # in parts, to need no memory but the index
         position = torch.arange(start, min(start + _CHUNK, length), device=ends.device)
         end = ends[torch.searchsorted(ends, position)]
-        left[(position + oldest) % length] = (end - position).to(dtype)
+        left[(position + oldest) % length] = (end - position).to(left.dtype)
     return TrajectoryIndex(length, oldest, ends, left)
+
+
+def _ordered(row: torch.Tensor, ends: torch.Tensor, oldest: int) -> TrajectoryIndex:
+    """Returns the index of trajectories with these rows, ``[T]``, by position."""
+    length = len(row)
+    order = row.to(_dtype(length))
+    place = torch.empty_like(order)
+    place[row] = torch.arange(length, dtype=order.dtype, device=order.device)
+    left = _index(length, 0, ends).left.index_select(0, place)
+    return TrajectoryIndex(length, oldest, ends, left, order, place)
+
+
+def _dtype(length: int) -> torch.dtype:
+    return torch.int32 if length < 1 << 31 else torch.int64
 
 
 def _joined(

@@ -156,9 +156,7 @@ class Setup:
 
     def score(self, rb: ReplayBuffer) -> None:
         estimator = Known(self.layout, graphs=self.case.transform == "coda")
-        score_buffer(
-            rb, estimator, 16, lookahead=0, key=self.key, check=False, progress=False
-        )
+        score_buffer(rb, estimator, 16, lookahead=0, key=self.key, progress=False)
 
     def storages(self) -> list[TensorStorage]:
         return [part.storage for part in self.parts]

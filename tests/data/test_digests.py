@@ -22,6 +22,7 @@ from torchrl_caiac.data.digests import (
     verify_digests,
     write_digests,
 )
+from torchrl_caiac.data.write_transitions import write_transitions
 
 
 def stored(folder, fill=1.0):
@@ -125,3 +126,20 @@ class TestContentDigests:
             for value in (tensor, tensor.clone(), change(tensor))
         ]
         assert digests[0] == digests[1] != digests[2]
+
+
+def test_contents_of_a_relative_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = TensorDict(
+        {
+            "action": torch.ones(3, 2),
+            "episode": torch.zeros(3, dtype=torch.int64),
+            "next": {"done": torch.ones(3, 1, dtype=torch.bool)},
+        },
+        [3],
+    )
+    stored = write_transitions(rows, "here")
+    assert content_digests(stored) == content_digests(load_transitions("here"))
+    assert content_digests(stored) == content_digests(
+        load_transitions(tmp_path / "here")
+    )

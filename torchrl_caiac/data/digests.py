@@ -98,7 +98,11 @@ def content_digests(rows: TensorDictBase, *added: NestedKey | None) -> dict[str,
 
 def _name(folder: str, leaf: torch.Tensor) -> str | None:
     file = getattr(leaf, "filename", None)
-    return None if file is None else Path(file).relative_to(folder).as_posix()
+    if file is None:
+        return None
+    # Either of them may be relative to the working directory.
+    path, root = Path(file).resolve(), Path(folder).resolve()
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else None
 
 
 def _tensor_digest(tensor: torch.Tensor) -> str:
