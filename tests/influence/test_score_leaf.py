@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -21,7 +25,9 @@ from tests.influence.scoring import (
     square,
     storage_of,
 )
+from tests.killing import run_killed
 from torchrl_caiac._fingerprints import fingerprint_key
+from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import (
     score_buffer,
     score_file,
@@ -149,3 +155,64 @@ def test_nothing_is_written_if_the_estimator_does_not_fit(tmp_path):
             score_buffer(rb, bad, progress=False)
     assert sorted(p.name for p in (tmp_path / "data").rglob("*")) == files
     assert KEY not in rb.storage[:].keys(include_nested=True)
+
+
+class TestMachines:
+    def opened(self, folder):
+        return offline_buffer(load_transitions(folder), 4)
+
+    def test_finished_scores_in_a_read_only_folder(self, tmp_path, read_only):
+        rows = episodes([5, 7])
+        rows.memmap(tmp_path / "data")
+        score_buffer(self.opened(tmp_path / "data"), Read(), progress=False)
+        read_only(tmp_path / "data")
+        rb, estimator = self.opened(tmp_path / "data"), Read()
+        score_buffer(rb, estimator, progress=False)
+        assert estimator.rows == []
+        torch.testing.assert_close(scores(rb), definition(rows, square, 1, 1))
+
+    def test_a_full_disk_is_an_error_and_leaves_the_data_as_they_were(self, small_disk):
+        rows = episodes([100_000])
+        rows.exclude("action").memmap(small_disk / "data")
+        free = (4 << 20) - sum(
+            file.stat().st_size for file in (small_disk / "data").rglob("*.memmap")
+        )
+        assert 0 < free < 100_000 * 20  # of 8 bytes a fingerprint and 12 for scores
+        rb = self.opened(small_disk / "data")
+        with pytest.raises(OSError, match=r"the disk is full: .*\.memmap needs \d+"):
+            score_buffer(rb, Read(), progress=False)
+        again = load_transitions(small_disk / "data", keys=["episode"])
+        assert torch.equal(again["observation"], rows["observation"])
+        assert KEY not in again.keys(include_nested=True)
+
+    def test_a_kill_while_the_leaf_is_added_is_undone(self, tmp_path, monkeypatch):
+        rows = episodes([5, 7])
+        rows.memmap(tmp_path / "data")
+
+        def work():
+            # tensordict empties meta.json before it writes it again.
+            original = Path.open
+
+            def stop(self, *args, **kwargs):
+                file = original(self, *args, **kwargs)
+                if self.name == "meta.json" and "w" in str(
+                    args + tuple(kwargs.items())
+                ):
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return file
+
+            monkeypatch.setattr(Path, "open", stop)
+            monkeypatch.setattr(
+                "builtins.open",
+                lambda file, *args, **kwargs: stop(Path(file), *args, **kwargs),
+            )
+            score_buffer(self.opened(tmp_path / "data"), Read(), progress=False)
+            yield
+
+        run_killed(work)
+        assert any(
+            not file.stat().st_size for file in (tmp_path / "data").rglob("meta.json")
+        )
+        rb = self.opened(tmp_path / "data")
+        score_buffer(rb, Read(), progress=False)
+        torch.testing.assert_close(scores(rb), definition(rows, square, 1, 1))
