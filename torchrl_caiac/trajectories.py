@@ -41,7 +41,8 @@ class TrajectoryIndex(NamedTuple):
 
     Each row has a position. The rows of a trajectory are at consecutive positions, in
     the order of time, wherever they lie in the storage. The index takes 4 bytes for
-    each row if trajectories lie one after another, and 12 if they are interleaved.
+    each row if trajectories lie one after another. If they are interleaved, it takes
+    12, and up to 70 while it is built.
 
     The rows of a storage with several dimensions, ``[T, *B]``, are counted in the order
     of its flattened data: row ``t * B + b`` is step ``t`` of the environment ``b``.
@@ -219,7 +220,9 @@ def trajectory_index(
         last = ended.clone()
         last[:-1] |= ids[1:] != ids[:-1]
     ends = last.nonzero()[:, 0]
-    pieces = None if ids is None else _joined(ids[ends], ended[ends], ends, steps)
+    is_final = ended[ends]
+    del last, ended  # to need little more memory than the index
+    pieces = None if ids is None else _joined(ids[ends], is_final, ends, steps)
     if pieces is None and streams == 1:
         return _index(length, oldest, ends)
     if pieces is None:

@@ -159,7 +159,7 @@ def test_nothing_is_written_if_the_estimator_does_not_fit(tmp_path):
 
 class TestMachines:
     def opened(self, folder):
-        return offline_buffer(load_transitions(folder), 4)
+        return offline_buffer(load_transitions(folder, keys=["episode"]), 4)
 
     def test_finished_scores_in_a_read_only_folder(self, tmp_path, read_only):
         rows = episodes([5, 7])
