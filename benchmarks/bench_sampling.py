@@ -29,6 +29,7 @@ from torchrl.data import ReplayBuffer, SliceSampler, TensorStorage
 
 from benchmarks.ratios import seconds
 from torchrl_caiac import EntityLayout
+from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
 from torchrl_caiac.transforms import CAIACTransform, HindsightGoal, WindowGoal
 
 EPISODE = 100
@@ -95,7 +96,14 @@ class Setting:
         """Samples without the transform, with it, and with goals or other donors."""
         plain, swap = self.buffer(), self.buffer(self.caiac())
         donors = self.buffer(self.caiac(donors=self.storage))
-        calls = {"plain": plain.sample, "swap": swap.sample, "donors": donors.sample}
+        # The same scores without fingerprints.
+        trusted = self.buffer(self.caiac(score_key="trusted"))
+        calls = {
+            "plain": plain.sample,
+            "swap": swap.sample,
+            "donors": donors.sample,
+            "trusted": trusted.sample,
+        }
         if goals:
             calls["goals"] = self.with_goals().sample
         return calls
@@ -134,24 +142,31 @@ def chunk(layout: EntityLayout, width: int, action: int, goals: bool) -> TensorD
     # Influence comes in stretches: a tenth of the episodes for each entity.
     score = random(len(layout))[::EPISODE].repeat_interleave(EPISODE, 0) * 0.05
     score[score > 0.045] = 1.0
+    states = torch.rand(CHUNK + 1, width, generator=generator)
     td = {
-        "observation": random(width),
+        "observation": states[:-1],
         "action": random(action),
         "episode": torch.zeros(CHUNK, dtype=torch.int64),
         "next": {
-            "observation": random(width),
+            "observation": states[1:],
             "reward": random(1),
             "done": flag,
             "terminated": torch.zeros_like(flag),
             "truncated": flag.clone(),
         },
         ("caiac", "score"): score,
+        "trusted": score,
     }
     if goals:
         width = layout.goal_width
         td |= {"achieved_goal": random(width), "desired_goal": random(width)}
         td["next"]["achieved_goal"] = random(width)  # type: ignore[index]
-    return TensorDict(td, [CHUNK])
+    rows = TensorDict(td, [CHUNK])
+    state = state_hash(rows, layout.in_keys)
+    after = state_hash(rows, [layout.next(key) for key in layout.in_keys])
+    assert state is not None
+    rows[fingerprint_key(("caiac", "score"))] = fingerprint(state, after, 0)
+    return rows
 
 
 def filled(part: TensorDict, rows: int, where: Path | torch.device) -> TensorStorage:
@@ -228,6 +243,8 @@ def bench_transitions(
         for name, target in (("swap", 1.6), ("goals", 2.2), ("donors", 1.6)):
             label = f"{what} transitions, {LABELS[name]} / plain, {rows} {kind}"
             judge(label, times[name] / times["plain"], at_most=target)
+        label = f"{what} transitions, fingerprints compared / not, {rows} {kind}"
+        judge(label, times["swap"] / times["trusted"], at_most=1.05)
     benchmark.pedantic(calls["swap"], rounds=50)
 
 
@@ -244,6 +261,8 @@ def bench_windows(
     for name in ("swap", "goals", "donors"):
         label = f"500 windows of 20, {LABELS[name]} / plain, {rows} {kind}"
         judge(label, times[name] / times["plain"], at_most=1.25)
+    label = f"500 windows of 20, fingerprints compared / not, {rows} {kind}"
+    judge(label, times["swap"] / times["trusted"], at_most=1.05)
     rate = 500 / times["short"] / AUTHORS_WINDOWS_PER_S
     label = f"windows of 10 a second, goals and swap / quoted 4,900, {rows} {kind}"
     judge(label, rate, at_least=20)
