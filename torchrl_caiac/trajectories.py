@@ -237,10 +237,8 @@ def trajectory_index(
         row = row * streams + torch.div(place, steps, rounding_mode="floor")
     position = torch.empty_like(row)
     position[row.long()] = torch.arange(length, dtype=dtype, device=row.device)
-    found = _index(length, 0, ends, dtype)
-    return TrajectoryIndex(
-        length, oldest * streams, ends, _picked(found.left, position), row, position
-    )
+    left = _index(length, 0, ends, dtype).left.index_select(0, position)
+    return TrajectoryIndex(length, oldest * streams, ends, left, row, position)
 
 
 def flat_rows(
