@@ -356,6 +356,8 @@ def _existing(
             "score_buffer(..., overwrite=True) to replace them, or give another key"
         )
     has_others = row_states(data, leaves, layout, length, settings_digest(settings))[1]
+    if record is not None and record.get("entities") != list(layout.names):
+        has_others = True  # whose fingerprints are not those of these entities
     if has_others:
         differences = "see the settings of the earlier call"
         if record is not None:

@@ -263,7 +263,11 @@ class BufferDonors:
             return scores
         next_keys = [layout.next(key) for key in layout.in_keys]
         is_valid = rows_with_fingerprints(
-            data, plain_tensor(known)[:length], layout.in_keys, next_keys
+            data,
+            plain_tensor(known)[:length],
+            layout.in_keys,
+            next_keys,
+            layout.names,
         )
         if bool(is_valid.all()):
             return scores
