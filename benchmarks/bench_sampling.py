@@ -165,7 +165,9 @@ def chunk(layout: EntityLayout, width: int, action: int, goals: bool) -> TensorD
     state = state_hash(rows, layout.in_keys)
     after = state_hash(rows, [layout.next(key) for key in layout.in_keys])
     assert state is not None
-    rows[fingerprint_key(("caiac", "score"))] = fingerprint(state, after, 0)
+    rows[fingerprint_key(("caiac", "score"))] = fingerprint(
+        state, after, layout.names, 0
+    )
     return rows
 
 

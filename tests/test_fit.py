@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer, Unbounded
 
 import torchrl_caiac.fit as module
 from tests.killing import run_killed
@@ -419,6 +419,15 @@ def test_divergence_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_wrong_arguments_are_named(kwargs: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         fit(make(), world(100), **kwargs)
+
+
+def test_a_replay_buffer_is_refused() -> None:
+    data = world(40)
+    rb = ReplayBuffer(storage=LazyTensorStorage(60), batch_size=8)
+    rb.extend(data)
+    with pytest.raises(TypeError, match=r"is a ReplayBuffer.*rb\.storage\[:\]"):
+        fit(make(), rb)
+    torch.testing.assert_close(fit(make(), rb.storage[:]), fit(make(), data))
 
 
 def test_wrong_data_are_named(tmp_path: Path) -> None:

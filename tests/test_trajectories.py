@@ -126,6 +126,30 @@ def test_rows_of_parallel_environments_may_be_interleaved():
     assert again.is_storage_order and again.lengths.tolist() == [2, 1, 2]
 
 
+@pytest.mark.parametrize("ids, size", [([0, 0, 0, 1, 1], 4), ([0, 1, 0, 1, 0], 12)])
+def test_bytes_of_each_row(ids, size):
+    index = trajectory_index(rows(ids))
+    of_rows = [x for x in (index.left, index.order, index.place) if x is not None]
+    assert sum(x.element_size() * x.numel() for x in of_rows) == size * len(ids)
+
+
+def test_dimensions_that_are_transposed_in_memory_are_refused():
+    data = TensorDict({"episode": torch.zeros(2, 3, 4)}, [2, 3, 4])
+    rb = ReplayBuffer(storage=LazyTensorStorage(24, ndim=3))
+    rb.extend(data)  # stored as [4, 3, 2], in the memory order of [4, 2, 3]
+    with pytest.raises(ValueError, match=r"\[4, 3, 2\] of 'episode'.*LazyMemmapStora"):
+        trajectory_index(rb)
+    for rb, stored in (
+        (ReplayBuffer(storage=LazyMemmapStorage(24, ndim=3)), data),
+        (
+            ReplayBuffer(storage=LazyTensorStorage(24, ndim=3), dim_extend=0),
+            data.permute(2, 0, 1),
+        ),
+    ):
+        rb.extend(stored.contiguous())
+        assert trajectory_index(rb).length == 24
+
+
 def test_the_end_flags_of_one_environment_may_be_in_two_leaves():
     data = rows([0, 0, 0])
     data["next", "terminated"] = data["next"].pop("done")

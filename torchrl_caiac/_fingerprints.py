@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
@@ -22,8 +23,6 @@ __all__ = [
     "state_leaves",
 ]
 
-# The upper half of a fingerprint less the hash of its states; settings are the lower.
-_MAGIC = 0x43414943
 _MASK = (1 << 64) - 1
 # The hash of the next state enters with this factor, so that it is no longer a hash of
 # the same kind as that of the state.
@@ -82,13 +81,17 @@ def state_hash(
 
 
 def fingerprint(
-    state: torch.Tensor, after: torch.Tensor | None, settings: int
+    state: torch.Tensor,
+    after: torch.Tensor | None,
+    names: Sequence[str],
+    settings: int,
 ) -> torch.Tensor:
     """Returns the fingerprints of rows.
 
     Args:
         state (torch.Tensor): int64 ``[B]``, the hashes of their states.
         after (torch.Tensor, optional): int64 ``[B]``, those of their next states.
+        names (sequence of str): the entities, in the order of the scores.
         settings (int): what else the scores depend on, 32 bits.
 
     Returns:
@@ -100,13 +103,16 @@ def fingerprint(
         ...     fingerprint, is_fingerprint_of, settings_of
         ... )
         >>> state, after = torch.tensor([5, 6]), torch.tensor([7, 8])
-        >>> known = fingerprint(state, after, settings=3)
-        >>> is_fingerprint_of(known, state, after.flip(0))
+        >>> known = fingerprint(state, after, ("arm", "cup"), settings=3)
+        >>> is_fingerprint_of(known, state, after.flip(0), ("arm", "cup"))
+        tensor([False, False])
+        >>> is_fingerprint_of(known, state, after, ("cup", "arm"))
         tensor([False, False])
         >>> settings_of(known, state, after)
         tensor([3, 3])
     """
-    return _joint(state, after) + _signed((_MAGIC << 32) | (settings & 0xFFFFFFFF))
+    upper = _upper_half(tuple(names)) << 32
+    return _joint(state, after) + _signed(upper | (settings & 0xFFFFFFFF))
 
 
 def matches(
@@ -114,6 +120,7 @@ def matches(
     known: torch.Tensor,
     keys: Sequence[NestedKey],
     next_keys: Sequence[NestedKey],
+    names: Sequence[str],
 ) -> torch.Tensor:
     """Returns which rows still have the states of their fingerprints.
 
@@ -122,22 +129,26 @@ def matches(
         known (torch.Tensor): their fingerprints, int64 ``[B]``.
         keys (sequence of NestedKey): the entries of states.
         next_keys (sequence of NestedKey): the entries of next states.
+        names (sequence of str): the entities, in the order of the scores.
 
     Returns:
         torch.Tensor: bool ``[B]``.
     """
     left = known
-    for names, factor in ((keys, 1), (next_keys, _NEXT)):
-        for number, leaf in enumerate(state_leaves(td, names)):
+    for entries, factor in ((keys, 1), (next_keys, _NEXT)):
+        for number, leaf in enumerate(state_leaves(td, entries)):
             left = left - _weighted(_lanes(leaf), number, factor)
-    return left >> 32 == _MAGIC
+    return left >> 32 == _upper_half(tuple(names))
 
 
 def is_fingerprint_of(
-    known: torch.Tensor, state: torch.Tensor, after: torch.Tensor | None
+    known: torch.Tensor,
+    state: torch.Tensor,
+    after: torch.Tensor | None,
+    names: Sequence[str],
 ) -> torch.Tensor:
     """Returns which rows still have the states of their fingerprints, bool ``[B]``."""
-    return (known - _joint(state, after)) >> 32 == _MAGIC
+    return (known - _joint(state, after)) >> 32 == _upper_half(tuple(names))
 
 
 def settings_of(
@@ -152,6 +163,7 @@ def rows_with_fingerprints(
     known: torch.Tensor,
     keys: Sequence[NestedKey],
     next_keys: Sequence[NestedKey],
+    names: Sequence[str],
     *,
     batch_size: int = 1 << 16,
 ) -> torch.Tensor:
@@ -162,6 +174,7 @@ def rows_with_fingerprints(
         known (torch.Tensor): the fingerprints, int64 ``[T]``.
         keys (sequence of NestedKey): the entries of states.
         next_keys (sequence of NestedKey): the entries of next states.
+        names (sequence of str): the entities, in the order of the scores.
 
     Keyword Args:
         batch_size (int): rows that are read at a time. Defaults to 65,536.
@@ -172,8 +185,18 @@ def rows_with_fingerprints(
     found = torch.zeros(len(known), dtype=torch.bool, device=known.device)
     for start in range(0, len(known), batch_size):
         rows = slice(start, min(start + batch_size, len(known)))
-        found[rows] = matches(td[rows], known[rows], keys, next_keys)
+        found[rows] = matches(td[rows], known[rows], keys, next_keys, names)
     return found
+
+
+@lru_cache(maxsize=256)
+def _upper_half(names: tuple[str, ...]) -> int:
+    """Returns the upper half of a fingerprint less the hash of its states.
+
+    So that no score is used for another entity. The lower half is the settings.
+    """
+    digest = hashlib.sha256("\0".join(names).encode()).digest()
+    return int.from_bytes(digest[:4], "big") >> 1  # not negative
 
 
 def _joint(state: torch.Tensor, after: torch.Tensor | None) -> torch.Tensor:

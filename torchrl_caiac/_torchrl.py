@@ -101,7 +101,7 @@ def storage_rows(storage: Any, what: str = "the storage") -> TensorDictBase:
 
     Raises:
         TypeError: it is not a :class:`~torchrl.data.TensorStorage` of tensordicts.
-        ValueError: it is empty.
+        ValueError: it is empty, or its dimensions are transposed in memory.
 
     Examples:
         >>> import torch
@@ -119,10 +119,20 @@ def storage_rows(storage: Any, what: str = "the storage") -> TensorDictBase:
         return data
     rows = data.batch_size[:dims].numel()
 
-    def flat(leaf: Tensor) -> Tensor:
-        return leaf.as_subclass(Tensor).view(rows, *leaf.shape[dims:])
+    def flat(key: NestedKey, leaf: Tensor) -> Tensor:
+        try:
+            return leaf.as_subclass(Tensor).view(rows, *leaf.shape[dims:])
+        except RuntimeError:
+            raise ValueError(
+                f"the dimensions {list(leaf.shape[:dims])} of {key!r} in {what} are "
+                f"transposed in memory, strides {list(leaf.stride()[:dims])}: use "
+                "LazyMemmapStorage, or a buffer with dim_extend=0 that is extended "
+                "with data [T, *B]"
+            ) from None
 
-    flattened = data.apply(flat, batch_size=[rows], device=data.device)
+    flattened = data.named_apply(
+        flat, nested_keys=True, batch_size=[rows], device=data.device
+    )
     assert flattened is not None  # it would be None without leaves
     return flattened
 

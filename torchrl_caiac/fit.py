@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import Bounded
+from torchrl.data import Bounded, ReplayBuffer
 from tqdm.auto import tqdm
 
 from torchrl_caiac._keys import as_key, floating, get_leaf, jsonable
@@ -113,6 +113,7 @@ def fit_world_model(
         and ``("validation_mse", <entity>)``, in squared physical units.
 
     Raises:
+        TypeError: the data are a replay buffer.
         KeyError: a key is missing in the data.
         ValueError: an argument is out of range; the data are empty, contain NaN or
             infinite values, do not fit the model, or have fewer than two trajectories;
@@ -160,6 +161,10 @@ def fit_world_model(
     if not 0 < validation_fraction < 1:
         raise ValueError(
             f"validation_fraction must be between 0 and 1, got {validation_fraction!r}"
+        )
+    if isinstance(data, ReplayBuffer):  # whose samples never end
+        raise TypeError(
+            f"data is a {type(data).__name__}, expected transitions: pass rb.storage[:]"
         )
     sources = [data] if isinstance(data, TensorDictBase) else list(data)
     bounds = known_bounds(sources, action_spec, model.action_dim)

@@ -103,6 +103,24 @@ def test_a_score_is_used_only_for_its_own_state(
             transform(td)
 
 
+@pytest.mark.parametrize("by_donors", [False, True])
+def test_scores_are_not_used_for_other_entities(by_donors: bool) -> None:
+    columns = {name: FLAT.columns[name] for name in reversed(FLAT.names)}
+    other = EntityLayout(
+        columns, goal=FLAT.goal, achieved=FLAT.achieved, fixed=FLAT.fixed
+    )
+    rb = scored()
+    if by_donors:
+        transform = CAIACTransform(other, donors=rb, unscored="keep", check=False)
+        assert not transform(rb.storage[:])["caiac", "swapped"].any()
+    else:
+        with pytest.raises(ValueError, match="not those of the entities.*in this ord"):
+            CAIACTransform(other)(rb.storage[:])
+    known = dict.fromkeys(stored(rb)["row"].tolist(), torch.zeros(N))
+    with pytest.raises(ValueError, match="other settings: .*layout was"):
+        score_buffer(rb, KnownScores(other, known), lookahead=0, progress=False)
+
+
 @pytest.mark.parametrize(
     "dtype", [torch.float16, torch.float32, torch.float64, torch.int64]
 )

@@ -142,6 +142,16 @@ def test_index_of_donors_is_rebuilt_only_after_writes() -> None:
     assert transform(td)["caiac", "swapped"].any()
 
 
+def test_index_of_donors_is_rebuilt_for_another_storage() -> None:
+    donors, other = small(), small()
+    transform = CAIACTransform(FLAT, donors=donors, counterfactual_ratio=1.0)
+    td = small(batch=4).sample()
+    assert transform(td)["caiac", "swapped"].any()
+    other.storage[:]["caiac", "score"].fill_(1.0)
+    donors.set_storage(other.storage)  # as many writes, rows and the same newest row
+    assert not transform(td)["caiac", "swapped"].any()
+
+
 def test_unscored_donors_are_not_eligible() -> None:
     donors = small()
     score = donors.storage[:]["caiac", "score"]

@@ -268,6 +268,17 @@ def test_end_flags_follow_the_goal(path: str) -> None:
     assert td["next", "terminated"].sum() == 1
 
 
+def test_rewards_over_several_steps_are_refused() -> None:
+    td = whole_numbers()
+    td["steps_to_next_obs"] = torch.full((8, 1), 3)
+    message = r"'steps_to_next_obs'.*leave out MultiStepTransform"
+    with pytest.raises(ValueError, match=message):
+        CAIACTransform(LAYOUT, reward_fn=distance)(td)
+    with pytest.raises(ValueError, match=message):
+        HindsightGoal(LAYOUT, distance, future=0.0)(td)
+    assert CAIACTransform(LAYOUT)(td)["caiac", "swapped"].any()
+
+
 @pytest.mark.parametrize("path", PATHS)
 def test_end_flags_under_other_keys(path: str) -> None:
     td = transitions()

@@ -345,6 +345,8 @@ def _existing(
     is_good, has_others = row_states(
         data, leaves, layout, length, settings_digest(settings)
     )
+    if record is not None and record.get("entities") != list(layout.names):
+        has_others = True  # whose fingerprints are not those of these entities
     if has_others:
         differences = "see the settings of the earlier call"
         if record is not None:

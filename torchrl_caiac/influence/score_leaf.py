@@ -149,7 +149,7 @@ def row_states(
         part = hashed[rows]
         state, after = state_hash(part, keys), state_hash(part, next_keys)
         assert state is not None  # the layout was checked
-        is_scored = is_fingerprint_of(known[rows], state, after)
+        is_scored = is_fingerprint_of(known[rows], state, after, layout.names)
         is_scored &= ~scores[rows].flatten(1).isnan().any(1)
         is_own = settings_of(known[rows], state, after) == settings & 0xFFFFFFFF
         has_others = has_others or bool((is_scored & ~is_own).any())

@@ -163,6 +163,7 @@ class ScoreOnWrite(BufferTransform):
         known = fingerprint(
             state,
             state_hash(flat, [layout.next(key) for key in layout.in_keys]),
+            layout.names,
             settings_digest(settings),
         )
         out = tensordict.copy()

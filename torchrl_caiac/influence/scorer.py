@@ -218,9 +218,8 @@ class Scorer:
         part = _taken(self._hashed, rows)
         state = state_hash(part, self._keys)
         assert state is not None  # layout.check found the state
-        return fingerprint(
-            state, state_hash(part, self._next_keys), self._settings
-        ).cpu()
+        after = state_hash(part, self._next_keys)
+        return fingerprint(state, after, self._layout.names, self._settings).cpu()
 
     def _final_scores(self, block: _Block) -> torch.Tensor:
         """Returns scores after smoothing and lookahead, ``[n, *feature_shape]``."""

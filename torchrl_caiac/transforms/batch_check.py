@@ -108,7 +108,9 @@ class BatchCheck:
         is_valid = crosses = None
         if self.window == 1:
             if known is not None:
-                is_valid = matches(td, known, self.layout.in_keys, self._next_keys)
+                is_valid = matches(
+                    td, known, self.layout.in_keys, self._next_keys, self.layout.names
+                )
         else:
             crosses = self._crossings(td)
             is_valid = self._follows(td, known)
@@ -217,7 +219,8 @@ class BatchCheck:
             f"{self.score_key!r} of other states than their own: call score_buffer on "
             "the replay buffer after writing to it, or pass unscored='keep'. If all "
             "rows are named, another transform may have changed the state before: "
-            "append this one first"
+            "append this one first. Or the scores are not those of the entities "
+            f"{list(self.layout.names)} in this order: use the layout of the estimator"
         )
 
     def _entities(self, bad: torch.Tensor) -> list[str]:
@@ -287,7 +290,7 @@ class BatchCheck:
         last = state_hash(td, self._next_keys, slice(window - 1, None, window))
         assert state is not None and last is not None  # there are leaves
         after = torch.cat([state.view(-1, window)[:, 1:], last.unsqueeze(1)], 1)
-        is_valid = is_fingerprint_of(known, state, after.flatten())
+        is_valid = is_fingerprint_of(known, state, after.flatten(), self.layout.names)
         return is_valid if bool(is_valid.all()) else None
 
     def _gaps(
@@ -306,7 +309,9 @@ class BatchCheck:
         state = state_hash(td, self.layout.in_keys)
         after = state_hash(td, self._next_keys)
         assert state is not None and after is not None  # the planner found the leaves
-        is_valid = None if known is None else is_fingerprint_of(known, state, after)
+        is_valid = None
+        if known is not None:
+            is_valid = is_fingerprint_of(known, state, after, self.layout.names)
         state, after = state.view(-1, self.window), after.view(-1, self.window)
         differs = state[:, 1:] != after[:, :-1]
         # A sampler that pads windows repeats rows.

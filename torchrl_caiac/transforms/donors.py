@@ -221,7 +221,8 @@ class BufferDonors:
             KeyError: the donors have no scores.
             ValueError: the buffer is empty, or its scores have the wrong width.
         """
-        revision = storage_revision(self.storage)
+        # With the storage, since the buffer may have got another one.
+        revision = self.storage, storage_revision(self.storage)
         if self._built is None or self._built[0] != revision:
             self._built = (revision, *self._build())
             self._read = None
@@ -262,7 +263,11 @@ class BufferDonors:
             return scores
         next_keys = [layout.next(key) for key in layout.in_keys]
         is_valid = rows_with_fingerprints(
-            data, plain_tensor(known)[:length], layout.in_keys, next_keys
+            data,
+            plain_tensor(known)[:length],
+            layout.in_keys,
+            next_keys,
+            layout.names,
         )
         if bool(is_valid.all()):
             return scores

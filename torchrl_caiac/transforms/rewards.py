@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import flatten
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.trajectories import STEPS_KEY
 from torchrl_caiac.transforms.checks import LateCheck
 from torchrl_caiac.transforms.goal_function import GoalFunction
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -240,9 +241,15 @@ class GoalLeaves:
         Raises:
             KeyError: rewards, actions or end flags are missing.
             ValueError: a leaf or the result of a function has the wrong shape or dtype,
-                or a reward is NaN or infinite.
+                a reward is NaN or infinite, or the rewards are sums over several steps.
         """
         keys = self.keys
+        if td.get(STEPS_KEY, None) is not None:
+            raise ValueError(
+                f"the batch has {STEPS_KEY!r}, so that {keys.reward!r} is a sum of "
+                "rewards over several steps, but reward_fn and terminated_fn see the "
+                "last state alone: leave out MultiStepTransform, or these functions"
+            )
         action = self._action(td)[first:] if self._needs_action else None
         leaves: dict[NestedKey, torch.Tensor] = {}
         if self._reward is not None:

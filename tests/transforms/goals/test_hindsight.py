@@ -452,6 +452,20 @@ def test_without_a_sample_unit() -> None:
         twice.rb.sample()
 
 
+def test_goals_of_a_sample_that_failed_are_not_those_of_other_rows() -> None:
+    case = build_case([9, 9], batch=18)
+    scores = case.rb.storage[:]["caiac", "score"]
+    known = scores.clone()
+    scores.fill_(math.nan)
+    with pytest.raises(ValueError, match="not scored"):
+        case.rb.sample()
+    scores.copy_(known)
+    with pytest.raises(RuntimeError, match="sample_unit="):
+        case.rb[:]
+    batch = case.rb.sample()
+    check_batch(case, batch, stored_rows(case.rb, batch))
+
+
 def test_before_the_augmentation_it_is_refused() -> None:
     for between in ([], [DoubleToFloat(in_keys=["desired_goal"])]):
         case = build_case([9, 9], order="relabel", data={"dtype": torch.double})

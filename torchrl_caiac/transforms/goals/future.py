@@ -15,7 +15,7 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_integers, draw_numbers
-from torchrl_caiac._torchrl import storage_rows
+from torchrl_caiac._torchrl import sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryCache, TrajectoryIndex
 from torchrl_caiac.transforms.checks import check_generator, check_layout
@@ -198,6 +198,24 @@ class FutureGoal(RandomTransform, SampleUnit):
         data = storage_rows(storage, "the buffer")
         assert isinstance(storage, TensorStorage)  # else storage_rows raised
         return data, self._cache.get(storage)
+
+    def keep_goals(self, goals: dict[NestedKey, torch.Tensor]) -> None:
+        """Keeps the goals of a batch until :meth:`take_goals`, in the same thread.
+
+        Args:
+            goals (dict): the goals by desired-goal leaf.
+        """
+        self._pending.goals = goals, sampling_buffer() is not None
+
+    def take_goals(self) -> dict[NestedKey, torch.Tensor] | None:
+        """Returns the goals that were kept for this batch, and forgets them.
+
+        Returns:
+            dict, optional: the goals; ``None`` if there are none, or if they are those
+            of a sample that failed, since this batch was not sampled.
+        """
+        goals, is_sample = self._pending.__dict__.pop("goals", (None, False))
+        return None if is_sample and sampling_buffer() is None else goals
 
     # --- reading ---------------------------------------------------------------------
 

@@ -233,9 +233,7 @@ class HindsightGoal(FutureGoal):
                 p=self.p,
                 generator=self.generator,
             )
-            self._pending.goals = self.read_goals(
-                data, trajectories.later(rows, offset)
-            )
+            self.keep_goals(self.read_goals(data, trajectories.later(rows, offset)))
         return index, info
 
     def generate_parameters(
@@ -365,7 +363,7 @@ class HindsightGoal(FutureGoal):
             KeyError: goals or rewards are missing.
             ValueError: goals or rewards have the wrong shape.
         """
-        goals = self._pending.__dict__.pop("goals", None)
+        goals = self.take_goals()
         shape = tensordict.batch_size
         if len(shape) != 1:
             tensordict = tensordict.reshape(-1)

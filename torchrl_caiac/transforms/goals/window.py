@@ -185,7 +185,7 @@ class WindowGoal(FutureGoal):
         offset = draw_goal_offset(
             remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
         )
-        self._pending.goals = self.read_goals(data, trajectories.later(last, offset))
+        self.keep_goals(self.read_goals(data, trajectories.later(last, offset)))
         return index, info
 
     def _check_windows(
@@ -260,7 +260,7 @@ class WindowGoal(FutureGoal):
             RuntimeError: no goals were drawn for this batch, or it was augmented
                 already.
         """
-        goals = self._pending.__dict__.pop("goals", None)
+        goals = self.take_goals()
         if goals is None:
             raise RuntimeError(
                 "no goals were drawn for this batch: pass the same WindowGoal as "
