@@ -114,11 +114,14 @@ def score_buffer(
 
     Both leaves are saved and loaded with the buffer, by ``dumps``, ``state_dict`` or
     TorchRL's checkpoints. A record of how the scores were computed (a digest of the
-    estimator's state, its ``repr`` and its layout, ``smoothing``, ``lookahead``,
-    ``every`` and the keys) is kept on the storage object, or, for a memory-mapped
-    storage with a folder, in the file that :func:`~torchrl_caiac.influence.score_file`
-    names. Scores with different settings are never mixed. ``batch_size`` may change
-    between calls; scores then agree up to rounding.
+    estimator, its layout, ``smoothing``, ``lookahead``, ``every`` and the keys) is kept
+    on the storage object, or, for a memory-mapped storage with a folder, in the file
+    that :func:`~torchrl_caiac.influence.score_file` names. Scores with different
+    settings are never mixed. ``batch_size`` may change between calls; scores then agree
+    up to rounding. The digest is of the estimator's ``state_dict``, ``repr`` and
+    attributes. An estimator whose attributes change while it scores, such as a counter,
+    needs a ``__repr__`` (a module: an ``extra_repr``) that names its settings: then
+    other attributes than models and tensors are left out.
 
     One process at a time may score a folder. Open data in a folder with
     :func:`torchrl_caiac.data.load_transitions`, which detects truncated files.
