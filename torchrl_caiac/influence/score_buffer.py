@@ -346,8 +346,18 @@ def _existing(
     """
     leaves = find_leaves(storage, key)
     record = read_record(storage, data, key)
-    if leaves is None or (record is not None and record["state"] == "new"):
-        return None, True  # none, or interrupted before the leaves were initialized
+    if record is not None and record["state"] == "new":
+        return None, True  # interrupted before the leaves were initialized
+    if leaves is None:
+        folder = memmap_folder(data) if data.is_memmap() else None
+        if folder is not None and record is not None:
+            raise ValueError(
+                f"scores in {key!r} were added to {folder} after these data were "
+                "opened: open them again with load_transitions, call "
+                "score_buffer(..., overwrite=True) to replace them, or give another "
+                "key"
+            )
+        return None, True
     check_shape(leaves, key, layout)
     # Leaves without scores may have been created with the first write to the buffer.
     if leaves.fingerprints is None:
