@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.killing import run_killed
 from tests.mutations import mutate_file
@@ -51,6 +52,18 @@ def test_opening_writes_nothing(tmp_path):
     assert loaded["next"].is_memmap()
     assert loaded["next"].is_locked
     assert {f: f.stat().st_mtime_ns for f in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("size", [6, 9])
+def test_rows_that_a_saved_buffer_does_not_use_are_no_data(size, tmp_path):
+    rb = ReplayBuffer(storage=LazyTensorStorage(size))
+    rb.extend(rows())
+    rb.dumps(tmp_path)
+    if size == 6:
+        assert (load_transitions(tmp_path / "storage") == rb.storage[:]).all()
+    else:
+        with pytest.raises(ValueError, match=r"uses 6 of its 9 rows.*rb\.loads"):
+            load_transitions(tmp_path / "storage")
 
 
 @pytest.mark.parametrize("name", ["observation", "next/observation", "odd%2Fkey"])

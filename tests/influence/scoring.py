@@ -26,6 +26,9 @@ class Read(nn.Module):
         self.rows.append(len(td))
         return (self.layout.read(td).float() * self.scale).square()
 
+    def extra_repr(self):
+        return ""  # what it counts is not a setting
+
 
 class Graph(Read):
     in_keys = ("observation", "action")

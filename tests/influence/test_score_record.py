@@ -13,6 +13,7 @@ from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
     ReplayBuffer,
+    TensorStorage,
 )
 
 from tests.influence.scoring import (
@@ -26,6 +27,7 @@ from tests.influence.scoring import (
     square,
 )
 from torchrl_caiac import EntityLayout
+from torchrl_caiac.data import load_transitions
 from torchrl_caiac.influence import (
     CAI,
     score_buffer,
@@ -62,6 +64,26 @@ def test_saved_and_loaded_scores_are_good(kind, way, tmp_path):
         expected = definition(loaded.storage[:], square, 1, 1)
         torch.testing.assert_close(scores(loaded), expected)
         assert sum(estimator.rows) <= 4
+
+
+def test_scores_that_another_handle_added_are_not_replaced(tmp_path):
+    rows = episodes([5, 7])
+    rows.memmap(tmp_path / "data")
+    first, late = (
+        ReplayBuffer(storage=TensorStorage(load_transitions(tmp_path / "data")))
+        for _ in range(2)
+    )
+    score_buffer(first, Read(), progress=False)
+    before = scores(first).clone()
+    with pytest.raises(ValueError, match=r"added to .*data after these data were open"):
+        score_buffer(late, Read(), smoothing=3, progress=False)
+    assert torch.equal(scores(first), before)
+    again = ReplayBuffer(storage=TensorStorage(load_transitions(tmp_path / "data")))
+    estimator = Read()
+    score_buffer(again, estimator, progress=False)
+    assert not estimator.rows
+    score_buffer(late, Read(), smoothing=3, overwrite=True, progress=False)
+    torch.testing.assert_close(scores(late), definition(rows, square, 3, 1))
 
 
 def test_interrupted_before_the_leaf_was_initialized(tmp_path):

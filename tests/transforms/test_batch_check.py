@@ -114,7 +114,7 @@ def test_scores_are_not_used_for_other_entities(by_donors: bool) -> None:
         transform = CAIACTransform(other, donors=rb, unscored="keep", check=False)
         assert not transform(rb.storage[:])["caiac", "swapped"].any()
     else:
-        with pytest.raises(ValueError, match=r"not those of the entities.*in this ord"):
+        with pytest.raises(ValueError, match=r"not those of the entities.*in this or"):
             CAIACTransform(other)(rb.storage[:])
     known = dict.fromkeys(stored(rb)["row"].tolist(), torch.zeros(N))
     with pytest.raises(ValueError, match=r"other settings: .*layout was"):

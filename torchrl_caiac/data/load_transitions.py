@@ -58,7 +58,8 @@ def load_transitions(
         UnreadableFileError: the folder is not a memory-mapped tensordict, is truncated,
             has something other than tensors (it could be a pickle, and is not read), or
             other content than its digests.
-        ValueError: it has no rows or several batch dimensions, or lacks a key.
+        ValueError: it has no rows or several batch dimensions, lacks a key, or is a
+            replay buffer that was saved before it was full.
 
     Examples:
         >>> import tempfile
@@ -88,6 +89,7 @@ def load_transitions(
             f"{path} has batch size {shape}, expected [T] with at least one row: store "
             "flat transitions"
         )
+    _check_is_full(path, shape[0])
     if verify:
         verify_digests(path)
     try:
@@ -113,6 +115,21 @@ def load_transitions(
         )
     mark_memmap(data)
     return data.lock_()
+
+
+def _check_is_full(folder: Path, rows: int) -> None:
+    """Raises if a folder is a storage, by ``dumps``, with rows that are not in use."""
+    file = folder / "storage_metadata.json"
+    if not file.exists():
+        return
+    content = read_json(file, "description of a saved storage", _AGAIN)
+    used = content.get("len") if isinstance(content, dict) else None
+    if used != rows:
+        raise ValueError(
+            f"{folder} is the storage of a saved replay buffer, which uses {used} of "
+            f"its {rows} rows, see {file.name}: load it with rb.loads(...), and write "
+            "rb.storage[:] to another folder with memmap(...)"
+        )
 
 
 def _check_folder(

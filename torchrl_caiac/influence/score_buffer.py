@@ -114,11 +114,14 @@ def score_buffer(
 
     Both leaves are saved and loaded with the buffer, by ``dumps``, ``state_dict`` or
     TorchRL's checkpoints. A record of how the scores were computed (a digest of the
-    estimator's state, its ``repr`` and its layout, ``smoothing``, ``lookahead``,
-    ``every`` and the keys) is kept on the storage object, or, for a memory-mapped
-    storage with a folder, in the file that :func:`~torchrl_caiac.influence.score_file`
-    names. Scores with different settings are never mixed. ``batch_size`` may change
-    between calls; scores then agree up to rounding.
+    estimator, its layout, ``smoothing``, ``lookahead``, ``every`` and the keys) is kept
+    on the storage object, or, for a memory-mapped storage with a folder, in the file
+    that :func:`~torchrl_caiac.influence.score_file` names. Scores with different
+    settings are never mixed. ``batch_size`` may change between calls; scores then agree
+    up to rounding. The digest is of the estimator's ``state_dict``, ``repr`` and
+    attributes. An estimator whose attributes change while it scores, such as a counter,
+    needs a ``__repr__`` (a module: an ``extra_repr``) that names its settings: then
+    other attributes than models and tensors are left out.
 
     One process at a time may score a folder. Open data in a folder with
     :func:`torchrl_caiac.data.load_transitions`, which detects truncated files.
@@ -330,8 +333,18 @@ def _existing(
     """
     leaves = find_leaves(storage, key)
     record = read_record(storage, data, key)
-    if leaves is None or (record is not None and record["state"] == "new"):
-        return None  # none, or interrupted before the leaves were initialized
+    if record is not None and record["state"] == "new":
+        return None  # interrupted before the leaves were initialized
+    if leaves is None:
+        folder = memmap_folder(data) if data.is_memmap() else None
+        if folder is not None and record is not None:
+            raise ValueError(
+                f"scores in {key!r} were added to {folder} after these data were "
+                "opened: open them again with load_transitions, call "
+                "score_buffer(..., overwrite=True) to replace them, or give another "
+                "key"
+            )
+        return None
     check_shape(leaves, key, layout)
     # Leaves without scores may have been created with the first write to the buffer.
     if leaves.fingerprints is None:

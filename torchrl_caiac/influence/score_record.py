@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
@@ -17,9 +15,9 @@ from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 from torchrl_caiac._keys import jsonable, path
 from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.estimator_digest import estimator_digest
 
 __all__ = [
-    "estimator_digest",
     "layout_digest",
     "read_record",
     "score_file",
@@ -215,33 +213,6 @@ def layout_digest(layout: EntityLayout) -> str:
         str: hexadecimal SHA-256.
     """
     return _sha(json.dumps(layout.to_dict(), sort_keys=True))
-
-
-def estimator_digest(estimator: Any) -> str:
-    """Returns a digest of what an estimator computes.
-
-    Args:
-        estimator (callable): its type, ``repr`` and ``state_dict`` enter the digest.
-
-    Returns:
-        str: hexadecimal SHA-256.
-    """
-    digest = hashlib.sha256()
-    kind = estimator if hasattr(estimator, "__qualname__") else type(estimator)
-    digest.update(f"{kind.__module__}.{kind.__qualname__}".encode())
-    # The repr has the settings that are no tensors. Addresses differ between processes.
-    digest.update(re.sub(r" at 0x[0-9a-fA-F]+", "", repr(estimator)).encode())
-    state = estimator.state_dict() if hasattr(estimator, "state_dict") else {}
-    for name in sorted(state):
-        value = state[name]
-        digest.update(name.encode())
-        if isinstance(value, torch.Tensor):
-            digest.update(f"{value.dtype}{list(value.shape)}".encode())
-            flat = value.detach().cpu().contiguous().reshape(-1)
-            digest.update(flat.view(torch.uint8).numpy().tobytes())
-        else:
-            digest.update(repr(value).encode())
-    return digest.hexdigest()
 
 
 def _folder(data: TensorDictBase) -> str | None:

@@ -1,0 +1,127 @@
+"""Digests of estimators: what changes the scores changes the digest."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from tests.influence.scoring import LAYOUT, episodes
+from torchrl_caiac.influence import score_buffer
+from torchrl_caiac.influence.estimator_digest import estimator_digest
+
+
+class Plain:
+    layout = LAYOUT
+
+    def __init__(self, scale):
+        self.scale = scale
+
+    def __call__(self, td):
+        return td["observation"].abs() * torch.as_tensor(self.scale)
+
+
+class Slotted:
+    __slots__ = ("scale",)
+
+    def __init__(self, scale):
+        self.scale = scale
+
+
+class Module(nn.Module):
+    def __init__(self, scale):
+        super().__init__()
+        self.scale = scale
+
+
+@dataclass
+class Wrapped:
+    model: nn.Module
+
+    def score(self, td):
+        return self.model(td["observation"])
+
+
+class Described(Plain):
+    def __repr__(self):
+        return "Described()"
+
+
+def linear(scale):
+    model = nn.Linear(3, 3)
+    nn.init.constant_(model.weight, scale)
+    nn.init.zeros_(model.bias)
+    return model
+
+
+def closure(scale):
+    return lambda td: td["observation"] * scale
+
+
+MAKERS = {
+    "number": Plain,
+    "tensor": lambda scale: Plain(torch.full((3,), scale)),
+    "array": lambda scale: Plain(np.full(10_000, scale)),
+    "list": lambda scale: Plain([1, (scale, "a")]),
+    "dict": lambda scale: Plain({"a": {"b": scale}}),
+    "set": lambda scale: Plain({"a", f"b{scale}"}),
+    "object": lambda scale: Plain(Plain(scale)),
+    "slots": Slotted,
+    "module in an object": lambda scale: Plain(linear(scale)),
+    "module in a dataclass": lambda scale: Wrapped(linear(scale)),
+    "attribute of a module": Module,
+    "attribute of a module inside": lambda scale: nn.Sequential(Module(scale)),
+    "weights": linear,
+    "closure": closure,
+    "default": lambda scale: lambda td, factor=scale: td["observation"] * factor,
+    "method": lambda scale: Wrapped(linear(scale)).score,
+    "partial": lambda scale: functools.partial(torch.mul, other=linear(scale)),
+}
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_what_changes_the_scores_changes_the_digest(make):
+    assert estimator_digest(make(1.0)) == estimator_digest(make(1.0))
+    assert estimator_digest(make(1.0)) != estimator_digest(make(2.0))
+
+
+def test_the_code_of_a_function_changes_the_digest():
+    def double(td):
+        return td["observation"] * 2
+
+    first = double
+
+    def double(td):
+        return td["observation"] * 3
+
+    assert first.__qualname__ == double.__qualname__
+    assert estimator_digest(first) != estimator_digest(double)
+
+
+def test_an_estimator_may_name_its_settings():
+    assert estimator_digest(Described(1.0)) == estimator_digest(Described(2.0))
+    models = Described(linear(1.0)), Described(linear(2.0))
+    assert estimator_digest(models[0]) != estimator_digest(models[1])
+
+
+def test_an_object_that_is_part_of_itself_has_a_digest():
+    estimators = [Plain(scale) for scale in (1.0, 1.0, 2.0)]
+    for estimator in estimators:
+        estimator.me = [estimator]
+    first, same, other = map(estimator_digest, estimators)
+    assert first == same != other
+
+
+def test_a_model_that_was_trained_further_has_other_scores():
+    rows: TensorDict = episodes([5, 7])
+    rb = ReplayBuffer(storage=LazyTensorStorage(20))
+    rb.extend(rows)
+    score_buffer(rb, Plain(1.0), progress=False)
+    with pytest.raises(ValueError, match="have other settings: estimator was"):
+        score_buffer(rb, Plain(3.0), progress=False)
