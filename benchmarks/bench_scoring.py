@@ -239,7 +239,14 @@ def bench_threads(
 
     def score(threads: int) -> None:
         torch.set_num_threads(threads)
-        score_buffer(rb, estimator, done_key=None, overwrite=True, progress=False)
+        score_buffer(
+            rb,
+            estimator,
+            done_key=None,
+            overwrite=True,
+            check=False,
+            progress=False,
+        )
 
     cores = min(4, len(os.sched_getaffinity(0)))
     calls = {n: partial(score, n) for n in (1, cores)}
@@ -361,7 +368,14 @@ def bench_growth(benchmark: Any, judge: Callable[..., None], tmp_path: Path) -> 
         rb = ReplayBuffer(storage=TensorStorage(data))
 
         def run(rb: ReplayBuffer = rb) -> None:
-            score_buffer(rb, estimator, smoothing=3, overwrite=True, progress=False)
+            score_buffer(
+                rb,
+                estimator,
+                smoothing=3,
+                overwrite=True,
+                check=False,
+                progress=False,
+            )
 
         rounds = 1 if rows == 1_000_000 else 3
         if rows == 1_000_000:
