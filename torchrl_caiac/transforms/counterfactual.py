@@ -364,8 +364,7 @@ class CounterfactualTransform(RandomTransform, ABC):
                 finite, a window is not one of successive rows, or a score belongs to
                 another state.
         """
-        if self.chosen_rows == "random":
-            self._check_buffer()
+        self._check_buffer(tensordict)
         shape = tensordict.batch_size
         if len(shape) != 1:
             self._check_shape(tensordict)
@@ -389,15 +388,23 @@ class CounterfactualTransform(RandomTransform, ABC):
         self._no_donor += draw.no_donor
         return out if len(shape) == 1 else out.reshape(shape)
 
-    def _check_buffer(self) -> None:
-        """Raises if the buffer relabels the first rows of a batch later."""
+    def _check_buffer(self, td: TensorDictBase) -> None:
+        """Raises if the buffer will relabel counterfactual rows of the batch."""
         buffer = sampling_buffer()
-        if isinstance(buffer, HERReplayBuffer) and buffer.her_ratio > 0:
+        if not isinstance(buffer, HERReplayBuffer) or not td.batch_size:
+            return
+        rows = td.batch_size[0]
+        relabeled = int(rows * buffer.her_ratio)
+        kept = 0  # the first rows, which are never counterfactual
+        if self.chosen_rows == "last" or self.counterfactual_ratio == 0:
+            windows = rows // self.window
+            kept = (windows - self.num_counterfactual(windows)) * self.window
+        if relabeled > kept:
             raise RuntimeError(
-                "HERReplayBuffer relabels the first rows of each batch after all "
-                "transforms, so these must not be counterfactual: pass rows='last' to "
-                f"{type(self).__name__}, and a her_ratio of at most "
-                "1 - counterfactual_ratio"
+                f"HERReplayBuffer relabels the first {relabeled} of {rows} rows of each "
+                "batch after all transforms, and some of them may be counterfactual: "
+                f"pass rows='last' to {type(self).__name__}, and a her_ratio of at most "
+                f"1 - counterfactual_ratio = {1 - self.counterfactual_ratio:g}"
             )
 
     def _check_shape(self, td: TensorDictBase) -> None:

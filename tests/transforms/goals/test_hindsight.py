@@ -234,12 +234,19 @@ def test_with_her_replay_buffer(swap_prob: float) -> None:
         seen += int(relabeled[8:].sum())
     assert 50 < seen < 110
     assert (case.rb.storage[:] == raw).all()
-    with pytest.raises(ValueError, match=r"first 12 rows.* 4 of which are counterfac"):
-        her_case(0.75, swap_prob=swap_prob, rows="last").rb.sample()
+    too_many = her_case(0.75, swap_prob=swap_prob, rows="last")
+    with pytest.raises(RuntimeError, match=r"first 12 of 16.*at most .* = 0\.5"):
+        too_many.rb.sample()
+    # Its own check, for an augmentation that another transform hides.
+    flagged = TensorDict(
+        {("caiac", "counterfactual"): torch.ones(4, 1, dtype=torch.bool)}, [4]
+    )
+    with pytest.raises(ValueError, match=r"first 4 rows.* 4 of which are counterfac"):
+        too_many.goals.her_reward(flagged)
 
 
 HER_NEEDS_LAST = (
-    "HERReplayBuffer relabels the first rows.*rows='last' to CAIACTransform.*"
+    r"HERReplayBuffer relabels the first \d+ of 16 rows.*rows='last' to CAIAC.*"
     "at most 1 - counterfactual_ratio"
 )
 
