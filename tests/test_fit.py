@@ -541,7 +541,7 @@ def test_data_sets_with_other_bounds_are_refused(tmp_path: Path) -> None:
         )
         for high in (1.0, 90.0)
     )
-    with pytest.raises(ValueError, match=r"data set 1 .* x \[-1, 90\].* x \[-1, 1\]"):
+    with pytest.raises(ValueError, match=r"dataset 1 .* x \[-1, 90\].* x \[-1, 1\]"):
         fit(make(), [one, other])
     fit(make(), [one, other], action_spec=SPEC)
 
@@ -603,7 +603,7 @@ def test_a_model_that_predicts_nothing_is_warned_of(
     data["next", "observation"][:, 2] = data["observation"][:, 2]
     fit(make(target=target), data, action_spec=SPEC, steps=20, lr=1e-6, check=False)
     (record,) = caplog.records
-    assert "the model predicts ['arm'] no better than that nothing moves" in (
+    assert "the model predicts ['arm'] no better than 'nothing moves'" in (
         record.getMessage()
     )
 

@@ -1,4 +1,4 @@
-"""Reading and writing files: whole, checked, with space, and by one process."""
+"""Reading and writing files: checks, disk space, locks and atomic writing."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def safe_meta(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def recover_meta(folder: str | os.PathLike[str]) -> bool:
-    """Undoes the addition of a leaf that was killed, where :func:`safe_meta` was used.
+    """Undoes the addition of a leaf by a process that was killed in :func:`safe_meta`.
 
     Nothing happens if every ``meta.json`` can be read. Otherwise, all of them become
     what they were before the leaf. If another process is adding a leaf right now, this
@@ -363,7 +363,7 @@ def read_json(path: str | os.PathLike[str], what: str, remedy: str) -> Any:
 
 
 def check_archive(path: str | os.PathLike[str], what: str, remedy: str) -> None:
-    """Raises if a ZIP file cannot be read in the space that it takes on disk.
+    """Raises if a ZIP file has compressed or encrypted parts, or is damaged.
 
     The files of this package are not compressed. A small compressed file could expand
     to any size.

@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, and what killed processes left of it."""
+"""Atomic writing, and removal of the partial files of killed processes."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def remove_leftovers(path: str | os.PathLike[str]) -> None:
 
 
 def remove_leftovers_in(folder: str | os.PathLike[str]) -> None:
-    """Removes what :func:`remove_leftovers` does, for all files in a folder.
+    """Removes all partial files and folders of killed processes in a folder.
 
     Args:
         folder (path): the folder.

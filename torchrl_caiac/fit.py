@@ -62,7 +62,7 @@ def fit_world_model(
     the step with the lowest negative log likelihood on the validation data. The scale
     of the targets comes from the training trajectories, unless the model has one
     already. The log has a warning if the best step was among the first tenth, or if the
-    model predicts an entity no better than that it does not move.
+    model predicts an entity no better than by assuming that it does not move.
 
     With ``checkpoint``, an interrupted call resumes where it stopped when it is
     repeated, and ends with the same weights, bit for bit, as an uninterrupted one. A
@@ -71,8 +71,8 @@ def fit_world_model(
     Args:
         model (EntityDynamicsModel): the model, changed in place.
         data (TensorDictBase or sequence of TensorDictBase): transitions ``[T]``, in
-            memory or memory-mapped. The transitions of a trajectory are stored one
-            after another. Trajectories of different data sets are distinct.
+            memory or memory-mapped. The transitions of a trajectory may be interleaved
+            with others. Trajectories of different datasets are distinct.
 
     Keyword Args:
         action_spec (Bounded, optional): the action space, ``[A]``, which is recorded in
@@ -85,8 +85,8 @@ def fit_world_model(
         lr (float): the learning rate. Defaults to ``8e-4``.
         validation_fraction (float): the fraction of the trajectories to hold out, at
             least one trajectory. Defaults to ``0.1``.
-        trajectory_key (NestedKey): the trajectory ids, integers ``[T]`` or ``[T, 1]``.
-            Defaults to ``"episode"``.
+        trajectory_key (NestedKey): the trajectory ids, integers ``[T]`` or ``[T, 1]``,
+            for example ``("collector", "traj_ids")``. Defaults to ``"episode"``.
         eval_every (int): the number of steps between two validations. Defaults to
             ``1_000``.
         max_validation_rows (int): the number of held-out transitions to validate on;
@@ -118,7 +118,7 @@ def fit_world_model(
         ValueError: an argument is out of range; the data are empty, contain NaN or
             infinite values, do not fit the model, or have fewer than two trajectories;
             an action is outside of its bounds by more than 1e-4 of their width; bounds
-            of several data sets differ; the checkpoint is truncated, or was made with
+            of several datasets differ; the checkpoint is truncated, or was made with
             other settings or data.
         RuntimeError: the loss is not finite.
         DatasetError: the check found errors.
@@ -268,7 +268,7 @@ def _check(
 
 
 class _Rows:
-    """The columns that the model reads, of several data sets, by row number."""
+    """The columns that the model reads, of several datasets, by row number."""
 
     def __init__(
         self,
@@ -476,7 +476,7 @@ class _Fit:
 
 @torch.no_grad()
 def _log_quality(fit: _Fit, rows: _Rows, validation: torch.Tensor) -> None:
-    """Logs a warning if the model overfits, or is no better than no motion."""
+    """Logs a warning if the model overfits, or predicts no better than no motion."""
     model = fit.model
     best = [row for row in fit.history if row["best"]][-1]
     if best["step"] <= 0.1 * fit.step:
@@ -503,7 +503,7 @@ def _log_quality(fit: _Fit, rows: _Rows, validation: torch.Tensor) -> None:
     ]
     if still:
         _LOGGER.warning(
-            "the model predicts %s no better than that nothing moves: its scores "
+            "the model predicts %s no better than 'nothing moves': its scores "
             "are not reliable. Fit more steps, or check that the data have the "
             "actions that cause the next states",
             still,

@@ -93,7 +93,7 @@ class Environment(ABC):
         return self.rows()
 
     def model_rows(self) -> list[TensorDictBase]:
-        """Returns the data sets that world models are fitted to."""
+        """Returns the datasets that world models are fitted to."""
         return [self.rows()]
 
     def held_out(self) -> TensorDictBase:

@@ -170,10 +170,10 @@ def test_rows_that_were_never_scored_raise() -> None:
     rb = scored(size=30)
     rb.append_transform(CAIACTransform(FLAT))
     rb.extend(later_rows(4).exclude("caiac"))
-    with pytest.raises(ValueError, match="NaN, that is not scored, in 4 of 24 rows"):
+    with pytest.raises(ValueError, match=r"NaN \(not scored\) in 4 of 24 rows"):
         rb[:]
     rb.add(later_rows(5).exclude("caiac")[4])
-    with pytest.raises(ValueError, match="NaN, that is not scored, in 5 of 25 rows"):
+    with pytest.raises(ValueError, match=r"NaN \(not scored\) in 5 of 25 rows"):
         rb[:]
 
 

@@ -163,7 +163,7 @@ def check_columns(
 def check_goals(
     layout: EntityLayout, sample: Sample, data: TensorDictBase
 ) -> list[Finding]:
-    """Finds achieved goals that are not the columns which they should mirror.
+    """Finds achieved goals that differ from the columns that they should equal.
 
     Args:
         layout (EntityLayout): the entities.
@@ -196,7 +196,7 @@ def check_goals(
             rows = sample.rows[wrong.any(1)]
             message = (
                 f"columns of {goal!r} differ from the columns of {state!r} that the "
-                f"layout says they mirror, for example {' or '.join(pairs)}"
+                f"layout assigns to them, for example {' or '.join(pairs)}"
             )
             findings.append(
                 finding(

@@ -71,9 +71,9 @@ def check_dataset(
     bounds or never vary; and values that are not finite. Each finding says what it does
     to counterfactuals, and what to do.
 
-    Errors make results wrong or let a later step fail. Warnings may be meant. Of large
-    data, whole trajectories or pieces of them are checked, chosen evenly, always the
-    same ones.
+    Errors make results wrong or make a later step fail. Warnings may describe what was
+    intended. In large data, only whole trajectories or parts of them are checked. They
+    are spread evenly and the same in every call.
 
     Args:
         data (TensorDictBase or ReplayBuffer): the transitions ``[T]``, in memory or

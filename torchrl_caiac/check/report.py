@@ -88,7 +88,11 @@ class Finding:
 
     def __str__(self) -> str:
         first = f"{self.severity:<8} {self.code}"
-        texts = [f"{self.message}.", f"Effect: {self.effect}.", f"Do: {self.remedy}."]
+        texts = [
+            f"{self.message}.",
+            f"Effect: {self.effect}.",
+            f"To do: {self.remedy}.",
+        ]
         if self.rows:
             more = self.count - len(self.rows)
             named = ", ".join(map(str, self.rows))
@@ -138,7 +142,7 @@ class DatasetReport:
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """The findings that may be meant."""
+        """The findings that may describe what was intended."""
         return tuple(f for f in self.findings if f.severity == "warning")
 
     @property

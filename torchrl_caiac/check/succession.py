@@ -271,9 +271,9 @@ def _check_time(
     piece = sample.piece[here]
     restarts = back & (time[there] <= least[piece])
     if 2 * int(restarts.sum()) >= int(back.sum()):
-        message = f"the time starts again inside of {len(rows)} trajectories"
+        message = f"the time starts again within {len(rows)} trajectories"
         return [finding("end_missing", message, rows=rows)], back
-    message = f"the time goes back after {len(rows)} rows inside of trajectories"
+    message = f"the time goes back after {len(rows)} rows within trajectories"
     found = finding("rows_out_of_order", message, rows=rows)
     unsorted = torch.zeros(pieces, dtype=torch.bool)
     unsorted[piece[back]] = True

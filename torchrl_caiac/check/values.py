@@ -71,7 +71,7 @@ def check_finite(
 def find_padding(
     data: TensorDictBase, sample: Sample, states: States, action: torch.Tensor | None
 ) -> tuple[list[Finding], torch.Tensor]:
-    """Finds rows of padding: those a mask leaves out, and those of zeros alone.
+    """Finds rows of padding: those a mask leaves out, and those with only zeros.
 
     Args:
         data (TensorDictBase): all transitions.
@@ -96,7 +96,7 @@ def find_padding(
     if not bool(padded.any()) or bool(padded.all()):
         return [], torch.zeros_like(padded)
     rows = sample.rows[padded]
-    message = f"{len(rows)} checked rows are padding (masked, or zeros alone)"
+    message = f"{len(rows)} checked rows are padding (masked, or only zeros)"
     return [finding("padded_rows", message, rows=rows)], padded
 
 

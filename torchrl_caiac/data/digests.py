@@ -1,4 +1,4 @@
-"""Digests of stored transitions, by which changed or decayed files are noticed."""
+"""Digests of stored transitions, which detect changed or damaged files."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def load_minari(
     source = _source(dataset)
     if has_digests(path) and data_source(path) != source:
         _logger.warning(
-            "%s was written from other data than those of %s now: it is replaced",
+            "%s was written from other data than %s has now: it is replaced",
             path,
             dataset.id,
         )

@@ -99,8 +99,8 @@ class CAI(nn.Module):
     Keyword Args:
         action_spec (Bounded, optional): the action space, ``[A]``. Defaults to the
             bounds that :func:`~torchrl_caiac.fit.fit_world_model` recorded in the
-            model or, with a warning, to [-1, 1] if there are none. A warning says so if
-            it differs from the recorded ones.
+            model or, with a warning, to [-1, 1] if there are none. If it
+            differs from the recorded bounds, there is a warning.
         seed (int): the seed of the actions. Defaults to 0.
         generator (torch.Generator, optional): draws the actions instead of ``seed``.
         approximation (str): as in

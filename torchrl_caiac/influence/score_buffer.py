@@ -100,10 +100,10 @@ def score_buffer(
     The leaf is float32 ``[T, N]`` (``[T, N + 1, N]`` for graphs), NaN where a row is
     not scored. Beside it, in ``("caiac", "score_fingerprint")`` for the default key,
     each row has a fingerprint of its state, its next state and the settings, int64
-    ``[T]``. So a score is used only for the state that it was computed from, whoever
-    writes to the buffer, and in whatever process: the transforms compare the
+    ``[T]``. So a score is used only for the state that it was computed from, whichever
+    process writes to the buffer: the transforms compare the
     fingerprints of every batch, and the next call of this function scores the rows
-    whose states have changed, and those around them whose windows they are in.
+    whose states have changed, and the rows whose windows contain these states.
     Rows that are written while this function runs are scored in another pass.
 
     The rows are scored in chunks of ``batch_size``. An interrupted call resumes where

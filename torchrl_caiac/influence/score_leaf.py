@@ -217,7 +217,7 @@ def _new_leaf(
 def _new_file(
     data: TensorDictBase, key: NestedKey, shape: torch.Size, dtype: torch.dtype
 ) -> torch.Tensor:
-    """Adds a leaf to memory-mapped data, whose folder stays readable if it is killed.
+    """Adds a leaf to memory-mapped data, whose folder survives a killed process.
 
     Raises:
         OSError: the disk is full; the leaf is removed.

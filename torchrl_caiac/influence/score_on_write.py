@@ -25,8 +25,8 @@ class ScoreOnWrite(BufferTransform):
     Append it to an empty buffer, for example one that collectors write to. With
     ``lookahead=1``, a transition gets the larger one of the scores of its state and its
     next state; with ``lookahead=0``, that of its state. These are the scores of
-    :func:`~torchrl_caiac.influence.score_buffer` without smoothing, which finds them
-    good if it is called with the same settings. Transitions are scored in batches, as
+    :func:`~torchrl_caiac.influence.score_buffer` without smoothing, which keeps
+    them if it is called with the same settings. Transitions are scored in batches, as
     they are written. Samples pass unchanged.
 
     Args:

@@ -87,7 +87,7 @@ def check_actions(
         key (NestedKey): the name of the actions in the error.
 
     Keyword Args:
-        tolerance (float): how far outside is still right, a share of the width.
+        tolerance (float): the tolerated excess, as a share of the width.
             Defaults to ``1e-4``.
         first_row (int): the number of the first row. Defaults to ``0``.
         remedy (str): the end of the message, which says what to do.
@@ -127,9 +127,9 @@ def known_bounds(
     """Returns the bounds of the actions of data, of a spec or stored with the data.
 
     Args:
-        sources (sequence of TensorDictBase): the data sets.
-        action_spec (Bounded, optional): the action space; it goes before what is
-            stored.
+        sources (sequence of TensorDictBase): the datasets.
+        action_spec (Bounded, optional): the action space; it takes precedence over
+            stored bounds.
         size (int): the size ``A`` of the actions.
 
     Returns:
@@ -138,7 +138,7 @@ def known_bounds(
 
     Raises:
         TypeError: the spec is not bounded.
-        ValueError: bounds have another size, or those of data sets differ.
+        ValueError: bounds have another size, or those of datasets differ.
     """
     if action_spec is not None:
         low, high = spec_bounds(action_spec, size)
@@ -150,12 +150,12 @@ def known_bounds(
             continue
         if tuple(found[0].shape) != (size,):
             raise ValueError(
-                f"data set {number} has bounds of {list(found[0].shape)} actions, "
+                f"dataset {number} has bounds of {list(found[0].shape)} actions, "
                 f"expected [{size}]: give the data of the model's actions"
             )
         if known is not None and not all(map(torch.equal, known, found)):
             raise ValueError(
-                f"data set {number} has actions in {bounds_text(found)}, but one "
+                f"dataset {number} has actions in {bounds_text(found)}, but one "
                 f"before it in {bounds_text(known)}: rescale one of them, or pass "
                 "action_spec if their actions mean the same"
             )

@@ -202,7 +202,7 @@ class BatchCheck:
         if nan.any():
             rows = int(nan.flatten(1).any(1).sum())
             raise ValueError(
-                f"{self.score_key!r} is NaN, that is not scored, in {rows} of "
+                f"{self.score_key!r} is NaN (not scored) in {rows} of "
                 f"{scores.shape[0]} rows for {self._entities(nan)}: call score_buffer "
                 "on the replay buffer after extending it, or pass unscored='keep'"
             )

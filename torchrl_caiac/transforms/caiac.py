@@ -69,8 +69,8 @@ class CAIACTransform(CounterfactualTransform):
             to 1.
         window (int): rows in a window, κ. Defaults to 1.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
-            Defaults to the rows of the same batch. A buffer has to be scored, have the
-            same layout. Pickling the transform pickles it.
+            Defaults to the rows of the same batch. A donor buffer needs scores and the
+            same layout. It is pickled with the transform.
         score_key (NestedKey): the scores, ``[*, N]``. Defaults to
             ``("caiac", "score")``.
         unscored (str): what happens to rows that have no score, or one of another

@@ -56,7 +56,8 @@ class CoDATransform(CounterfactualTransform):
         swap_prob (float): probability of swapping each component. Defaults to 1.
         window (int): rows in a window, κ. Defaults to 1.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
-            Defaults to the rows of the same batch. Pickling the transform pickles it.
+            Defaults to the rows of the same batch. A donor buffer needs graphs and the
+            same layout. It is pickled with the transform.
         graph_key (NestedKey): the graphs, ``[*, N + 1, N]``: from the row (the
             entities in layout order, then the action) to the column. Defaults to
             ``("coda", "graph")``.

@@ -185,7 +185,8 @@ def draw_batch_components(
 
     Args:
         masks (torch.Tensor): int64 ``[B, N]``, of :func:`components`.
-        num_windows (int): the number of windows that are drawn for, ``C``.
+        num_windows (int): the number of windows that donors are drawn for, ``C``: the
+            last ones of the batch.
 
     Keyword Args:
         window (int): rows in a window. Defaults to 1.

@@ -418,8 +418,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             sizes.pop()
         if not td.numel():
             raise ValueError(
-                f"the batch has shape {list(td.shape)}, that is no rows: sample from a "
-                "buffer that is not empty"
+                f"the batch has shape {list(td.shape)}, which has no rows: sample "
+                "from a buffer that is not empty"
             )
         if sizes[-1] % self.window:
             raise ValueError(

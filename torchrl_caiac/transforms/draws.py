@@ -1,8 +1,8 @@
 """Random draws: which entities are swapped, and which donors they get.
 
 Every function is pure. A *window* is ``window`` consecutive rows of a flat batch, ``B``
-is the number of windows, ``C`` the number of windows that are drawn for (the last ones
-of the batch), ``N`` the number of entities.
+is the number of windows, ``C`` the number of windows that donors are drawn for (all of
+them, or the last ones), ``N`` the number of entities.
 """
 
 from __future__ import annotations
@@ -149,7 +149,8 @@ def draw_batch_donors(
 
     Args:
         free (torch.Tensor): bool ``[B, N]``, the entities that may be swapped.
-        num_windows (int): the number of windows that are drawn for, ``C``.
+        num_windows (int): the number of windows that donors are drawn for, ``C``: the
+            last ones of the batch.
 
     Keyword Args:
         window (int): rows in a window. Defaults to 1.

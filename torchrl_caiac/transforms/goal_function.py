@@ -1,4 +1,4 @@
-"""Functions of achieved and desired goals, in the forms that users have them."""
+"""Functions of goals, with tensors or in Gymnasium's form."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ACCEPTED = (
 
 
 class GoalFunction:
-    """Calls a function of goals with what its signature asks for.
+    """Calls a function of goals with the arguments that its signature has.
 
     The signature decides, when the object is created:
 
