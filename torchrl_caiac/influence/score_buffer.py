@@ -103,7 +103,8 @@ def score_buffer(
     ``[T]``. So a score is used only for the state that it was computed from, whoever
     writes to the buffer, and in whatever process: the transforms compare the
     fingerprints of every batch, and the next call of this function scores the rows
-    whose states have changed, and those around them whose windows they are in.
+    whose states have changed, and those around them whose windows they are in. So it
+    does with rows that have lost or gained rows of their trajectory around them.
     Rows that are written while this function runs are scored in another pass.
 
     The rows are scored in chunks of ``batch_size``. An interrupted call resumes where
@@ -308,13 +309,19 @@ def _one_pass(
             write_record(storage, data, key, settings, layout, "scored")
     else:
         scorer.feature_shape = tuple(leaves.scores.shape[1:])
-        stale = ~row_states(
-            data, leaves, layout, index.length, settings_digest(settings)
-        )[0]
-        if not bool(stale.any()):
+        states = row_states(
+            data,
+            leaves,
+            layout,
+            index.length,
+            settings_digest(settings),
+            scorer.surroundings,
+        )
+        if bool((states.valid & ~states.moved).all()):
             return True
         every_position = torch.arange(index.length, device=index.device)
-        stale = stale[index.rows(every_position).cpu()]
+        rows = index.rows(every_position).cpu()
+        stale, moved = ~states.valid[rows], states.moved[rows]
         with _claimed(data):
             write_record(storage, data, key, settings, layout, "scoring")
             _score(
@@ -323,6 +330,7 @@ def _one_pass(
                 leaves,
                 stale,
                 steps,
+                moved=moved,
                 is_first=is_first,
                 progress=progress,
             )
@@ -368,7 +376,8 @@ def _existing(
             "(by another program, or an earlier version): call "
             "score_buffer(..., overwrite=True) to replace them, or give another key"
         )
-    has_others = row_states(data, leaves, layout, length, settings_digest(settings))[1]
+    digest = settings_digest(settings)
+    has_others = row_states(data, leaves, layout, length, digest).has_others
     if record is not None and record.get("entities") != list(layout.names):
         has_others = True  # whose fingerprints are not those of these entities
     if has_others:
@@ -389,6 +398,7 @@ def _score(
     stale: torch.Tensor,
     steps: torch.Tensor | None,
     *,
+    moved: torch.Tensor | None = None,
     is_first: bool,
     progress: bool,
 ) -> None:
@@ -402,6 +412,8 @@ def _score(
         steps (torch.Tensor, optional): ``[T]``, the steps to the next states.
 
     Keyword Args:
+        moved (torch.Tensor, optional): bool ``[T]`` by position, rows that are scored
+            too, but on which no others depend.
         is_first (bool): whether chunks are scored as a whole, so that an interrupted
             first pass ends with the same bytes as an uninterrupted one.
         progress (bool): show a progress bar.
@@ -422,6 +434,8 @@ def _score(
         counts = torch.cat([counts.new_zeros(1), counts])
         size = before + after + 1
         is_near = counts[size:] > counts[:-size]
+        if moved is not None:
+            is_near |= moved[span]
         if not bool(is_near.any()):
             continue
         if is_first:
