@@ -84,7 +84,7 @@ def fingerprint(
     state: torch.Tensor,
     after: torch.Tensor | None,
     names: Sequence[str],
-    settings: int,
+    settings: int | torch.Tensor,
 ) -> torch.Tensor:
     """Returns the fingerprints of rows.
 
@@ -92,7 +92,8 @@ def fingerprint(
         state (torch.Tensor): int64 ``[B]``, the hashes of their states.
         after (torch.Tensor, optional): int64 ``[B]``, those of their next states.
         names (sequence of str): the entities, in the order of the scores.
-        settings (int): what else the scores depend on, 32 bits.
+        settings (int or torch.Tensor): what else the scores depend on, 32 bits; one
+            number, or int64 ``[B]``.
 
     Returns:
         torch.Tensor: int64 ``[B]``.
@@ -112,7 +113,7 @@ def fingerprint(
         tensor([3, 3])
     """
     upper = _upper_half(tuple(names)) << 32
-    return _joint(state, after) + _signed(upper | (settings & 0xFFFFFFFF))
+    return _joint(state, after) + upper + (settings & 0xFFFFFFFF)
 
 
 def matches(

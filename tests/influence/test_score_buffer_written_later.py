@@ -106,6 +106,40 @@ def test_few_new_rows_cost_few_evaluations():
     torch.testing.assert_close(scores(rb), expected)
 
 
+@pytest.mark.parametrize("smoothing", [2, 5])
+@pytest.mark.parametrize("new", [1, 2, 5])
+def test_rows_that_lost_earlier_ones_are_scored_again(smoothing, new):
+    """In a ring, whose environments write in turn, so that rows are no neighbors."""
+    turns = [
+        torch.stack(episodes([9, 9], seed=i, first_id=2 * i).split(9), 1).reshape(-1)
+        for i in range(3)
+    ]
+    rows = torch.cat(turns)
+    rb = filled(rows[:30])
+    score_buffer(rb, Read(), 8, smoothing=smoothing, progress=False)
+    for start in range(30, 54 - new, new):
+        rb.extend(rows[start : start + new])
+        score_buffer(rb, Read(), 8, smoothing=smoothing, progress=False)
+        order = [(start + new + i) % 30 for i in range(30)]
+        ids = rb.storage[:]["episode"].tolist()
+        order.sort(key=lambda row: ids[row])  # stable: in the order of time
+        expected = definition(rb.storage[:], square, smoothing, 1, order)
+        torch.testing.assert_close(scores(rb), expected)
+
+
+@pytest.mark.parametrize("options", [{"smoothing": 3}, {"every": 3}])
+@pytest.mark.parametrize("key", ["episode", ("next", "done")])
+def test_trajectories_that_are_split_later_are_scored_again(key, options):
+    rb, expected = filled(episodes([9, 7])), filled(episodes([9, 7]))
+    score_buffer(rb, Read(), progress=False, **options)
+    for buffer in (rb, expected):
+        leaf = buffer.storage[:].get(key)
+        leaf[4:9] = 5 if key == "episode" else leaf[4:9].logical_not()
+    score_buffer(rb, Read(), check=False, progress=False, **options)
+    score_buffer(expected, Read(), check=False, progress=False, **options)
+    torch.testing.assert_close(scores(rb), scores(expected))
+
+
 def test_neighbors_of_later_rows_are_scored_again():
     rows = episodes([12])
     rows["next", "done"].zero_()

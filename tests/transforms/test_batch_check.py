@@ -593,7 +593,7 @@ def test_late_errors_of_scores() -> None:
     unscored = good.clone()
     unscored[KEY][2] = math.nan
     transform(unscored)
-    with pytest.raises(ValueError, match="not scored, in 1 of 8 rows"):
+    with pytest.raises(ValueError, match=r"not scored\) in 1 of 8 rows"):
         transform(unscored)
     other = good.clone()
     other["observation"][3, 1] += 1

@@ -435,7 +435,7 @@ def test_score_errors() -> None:
         transform(bad)
     bad["caiac", "score"] = torch.zeros(4, N)
     bad["caiac", "score"][1, 2] = math.nan
-    with pytest.raises(ValueError, match=r"not scored, in 1 of 4 rows for \['box'\]"):
+    with pytest.raises(ValueError, match=r"not scored\) in 1 of 4 rows for \['box'\]"):
         transform(bad)
     bad["caiac", "score"][1, 2] = math.inf
     with pytest.raises(ValueError, match=r"infinite for \['box'\]"):

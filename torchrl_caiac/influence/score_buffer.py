@@ -26,6 +26,7 @@ from torchrl_caiac._torchrl import (
 from torchrl_caiac.check import check_before_use
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import (
+    RowStates,
     ScoreLeaves,
     check_shape,
     find_leaves,
@@ -103,7 +104,8 @@ def score_buffer(
     ``[T]``. So a score is used only for the state that it was computed from, whichever
     process writes to the buffer: the transforms compare the
     fingerprints of every batch, and the next call of this function scores the rows
-    whose states have changed, and the rows whose windows contain these states.
+    whose states have changed, the rows whose windows contain these states, and rows
+    that have lost or gained rows of their trajectory around them.
     Rows that are written while this function runs are scored in another pass.
 
     The rows are scored in chunks of ``batch_size``. An interrupted call resumes where
@@ -292,26 +294,35 @@ def _one_pass(
     """Scores all rows without a valid score; returns whether there were none."""
     found = None
     if not overwrite:
-        found = _existing(storage, data, index.length, layout, key, settings)
+        found = _existing(storage, data, scorer, index.length, layout, key, settings)
     if found is None:
         # Score the first block before anything is written: an estimator or data that
         # do not fit leave the storage unchanged.
         feature_shape = tuple(scorer.block(0).state.shape[1:])
-        stale, is_first = torch.ones(index.length, dtype=torch.bool), True
+        stale = torch.ones(index.length, dtype=torch.bool)
+        moved, is_first = ~stale, True
     else:
-        leaves, is_good, is_first = found
-        if bool(is_good.all()):
+        leaves, states, is_first = found
+        if bool((states.valid & ~states.moved).all()):
             return True
         scorer.feature_shape = feature_shape = tuple(leaves.scores.shape[1:])
         position = torch.arange(index.length, device=index.device)
-        stale = ~is_good[index.rows(position).cpu()]
+        rows = index.rows(position).cpu()
+        stale, moved = ~states.valid[rows], states.moved[rows]
     with _claimed(data):
         if found is None:
             write_record(storage, data, key, settings, layout, "new")
             leaves = new_leaves(storage, key, feature_shape)
         write_record(storage, data, key, settings, layout, "scoring")
         _score(
-            scorer, index, leaves, stale, steps, is_first=is_first, progress=progress
+            scorer,
+            index,
+            leaves,
+            stale,
+            moved,
+            steps,
+            is_first=is_first,
+            progress=progress,
         )
         write_record(storage, data, key, settings, layout, "scored")
     add_revision(storage)
@@ -321,12 +332,13 @@ def _one_pass(
 def _existing(
     storage: TensorStorage,
     data: TensorDictBase,
+    scorer: Scorer,
     length: int,
     layout: EntityLayout,
     key: NestedKey,
     settings: dict[str, Any],
-) -> tuple[ScoreLeaves, torch.Tensor, bool] | None:
-    """Returns leaves to keep, their valid rows, and whether a pass was interrupted.
+) -> tuple[ScoreLeaves, RowStates, bool] | None:
+    """Returns leaves to keep, the states of rows, and whether a pass was interrupted.
 
     Raises:
         ValueError: the scores are of another origin or have other settings.
@@ -355,9 +367,9 @@ def _existing(
             "(by another program, or an earlier version): call "
             "score_buffer(..., overwrite=True) to replace them, or give another key"
         )
-    is_good, has_others = row_states(
-        data, leaves, layout, length, settings_digest(settings)
-    )
+    digest = settings_digest(settings)
+    states = row_states(data, leaves, layout, length, digest, scorer.surroundings)
+    has_others = states.has_others
     if record is not None and record.get("entities") != list(layout.names):
         has_others = True  # whose fingerprints are not those of these entities
     if has_others:
@@ -368,7 +380,7 @@ def _existing(
             f"the scores in {key!r} have other settings: {differences}. Call "
             "score_buffer(..., overwrite=True) to recompute them, or give another key"
         )
-    return leaves, is_good, record is not None and record["state"] == "scoring"
+    return leaves, states, record is not None and record["state"] == "scoring"
 
 
 def _score(
@@ -376,6 +388,7 @@ def _score(
     index: TrajectoryIndex,
     leaves: ScoreLeaves,
     stale: torch.Tensor,
+    moved: torch.Tensor,
     steps: torch.Tensor | None,
     *,
     is_first: bool,
@@ -388,6 +401,8 @@ def _score(
         index (TrajectoryIndex): the trajectories.
         leaves (ScoreLeaves): where they are written.
         stale (torch.Tensor): bool ``[T]`` by position.
+        moved (torch.Tensor): bool ``[T]`` by position, rows that are scored too, but on
+            which no others depend.
         steps (torch.Tensor, optional): ``[T]``, the steps to the next states.
 
     Keyword Args:
@@ -410,7 +425,7 @@ def _score(
         counts = stale[near].long().cumsum(0)
         counts = torch.cat([counts.new_zeros(1), counts])
         size = before + after + 1
-        is_near = counts[size:] > counts[:-size]
+        is_near = (counts[size:] > counts[:-size]) | moved[span]
         if not bool(is_near.any()):
             continue
         if is_first:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,9 +30,31 @@ from torchrl_caiac._torchrl import (
 )
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["ScoreLeaves", "check_shape", "find_leaves", "new_leaves", "row_states"]
+__all__ = [
+    "RowStates",
+    "ScoreLeaves",
+    "check_shape",
+    "find_leaves",
+    "new_leaves",
+    "row_states",
+]
 
 _CHUNK = 1 << 16
+
+
+class RowStates(NamedTuple):
+    """What is known about the scores of all rows of a storage, on the CPU.
+
+    Attributes:
+        valid (torch.Tensor): bool ``[T]``, which rows have a score of their state.
+        moved (torch.Tensor): bool ``[T]``, which of them had other rows around them in
+            their trajectory when they were scored.
+        has_others (bool): whether a row has a score of its state with other settings.
+    """
+
+    valid: torch.Tensor
+    moved: torch.Tensor
+    has_others: bool
 
 
 class ScoreLeaves(NamedTuple):
@@ -123,7 +146,8 @@ def row_states(
     layout: EntityLayout,
     length: int,
     settings: int,
-) -> tuple[torch.Tensor, bool]:
+    surroundings: Callable[[torch.Tensor], torch.Tensor] | None = None,
+) -> RowStates:
     """Returns which rows have a valid score.
 
     Args:
@@ -132,17 +156,20 @@ def row_states(
         layout (EntityLayout): the entities.
         length (int): the number of rows in use, ``T``.
         settings (int): the settings of the scores, 32 bits.
+        surroundings (callable, optional): maps rows to the surroundings that they have
+            now, see :meth:`~torchrl_caiac.influence.scorer.Scorer.surroundings`; by
+            default no row counts as moved.
 
     Returns:
-        tuple of torch.Tensor and bool: bool ``[T]`` on the CPU; and whether a row has a
-        score of its state with other settings.
+        RowStates: the states.
     """
     scores, known = leaves
     assert known is not None
     keys = layout.in_keys
     next_keys = [layout.next(key) for key in keys]
     hashed = data.select(*keys, *next_keys, strict=False)
-    is_good = torch.zeros(length, dtype=torch.bool)
+    valid = torch.zeros(length, dtype=torch.bool)
+    moved = torch.zeros(length, dtype=torch.bool)
     has_others = False
     for start in range(0, length, _CHUNK):
         rows = slice(start, min(start + _CHUNK, length))
@@ -151,10 +178,15 @@ def row_states(
         assert state is not None  # the layout was checked
         is_scored = is_fingerprint_of(known[rows], state, after, layout.names)
         is_scored &= ~scores[rows].flatten(1).isnan().any(1)
-        is_own = settings_of(known[rows], state, after) == settings & 0xFFFFFFFF
+        # Surroundings differ in the lower 16 bits alone.
+        differs = (settings_of(known[rows], state, after) ^ settings) & 0xFFFFFFFF
+        is_own = differs >> 16 == 0
         has_others = has_others or bool((is_scored & ~is_own).any())
-        is_good[rows] = (is_scored & is_own).cpu()
-    return is_good, has_others
+        valid[rows] = (is_scored & is_own).cpu()
+        if surroundings is not None:
+            now = surroundings(torch.arange(rows.start, rows.stop))
+            moved[rows] = valid[rows] & (differs.cpu() != now)
+    return RowStates(valid, moved, has_others)
 
 
 def new_leaves(

@@ -202,7 +202,9 @@ class Scorer:
         last = self._index.is_last(rows).cpu()
         # Before the scores: a state that is overwritten in between is found later.
         fingerprints = self._fingerprints(rows)
-        number = self._number(position)
+        number = torch.zeros_like(position)  # every state is scored
+        if self._every > 1:
+            number = self._number(position)
         state = self._scores(
             self._states, rows, _both(number % self._every == 0, is_needed), "state"
         )
@@ -219,7 +221,31 @@ class Scorer:
         state = state_hash(part, self._keys)
         assert state is not None  # layout.check found the state
         after = state_hash(part, self._next_keys)
-        return fingerprint(state, after, self._layout.names, self._settings).cpu()
+        settings = self.surroundings(rows) ^ self._settings
+        names = self._layout.names
+        return fingerprint(state, after, names, settings.to(state.device)).cpu()
+
+    def surroundings(self, rows: torch.Tensor) -> torch.Tensor:
+        """Returns what the scores of rows depend on besides states: what is around.
+
+        Args:
+            rows (torch.Tensor): int64 ``[n]``.
+
+        Returns:
+            torch.Tensor: int64 ``[n]``, 16 bits that depend on how many of the earlier
+            and later states that a score depends on are in the trajectory, and on the
+            row's place among the states that are scored; 0 if no state is missing.
+        """
+        index, (before, after) = self._index, self.reach
+        found = torch.zeros_like(rows)
+        if after > self._final:  # the state after a row is always there
+            left = index.remaining(rows.to(index.device)).cpu() + int(self._final)
+            found += (after - left).clamp_min(0) * 0x85EB
+        if before:
+            number = self._number(index.position(rows.to(index.device)).cpu())
+            found += (before - number).clamp_min(0) * 0x9E37
+            found += number % self._every * 0xC2B3
+        return found & 0xFFFF
 
     def _final_scores(self, block: _Block) -> torch.Tensor:
         """Returns scores after smoothing and lookahead, ``[n, *feature_shape]``."""
@@ -246,8 +272,6 @@ class Scorer:
 
     def _number(self, position: torch.Tensor) -> torch.Tensor:
         """Counts the rows of the same trajectory before each one, int64 ``[n]``."""
-        if self._every == 1:
-            return torch.zeros_like(position)  # every state is scored
         index = self._index
         position = position.to(index.device)
         number = torch.searchsorted(index.ends, position)

@@ -401,10 +401,11 @@ class CounterfactualTransform(RandomTransform, ABC):
             kept = (windows - self.num_counterfactual(windows)) * self.window
         if relabeled > kept:
             raise RuntimeError(
-                f"HERReplayBuffer relabels the first {relabeled} of {rows} rows of each "
-                "batch after all transforms, and some of them may be counterfactual: "
-                f"pass rows='last' to {type(self).__name__}, and a her_ratio of at most "
-                f"1 - counterfactual_ratio = {1 - self.counterfactual_ratio:g}"
+                f"HERReplayBuffer relabels the first {relabeled} of {rows} rows of "
+                "each batch after all transforms, and some of them may be "
+                f"counterfactual: pass rows='last' to {type(self).__name__}, and a "
+                "her_ratio of at most 1 - counterfactual_ratio = "
+                f"{1 - self.counterfactual_ratio:g}"
             )
 
     def _check_shape(self, td: TensorDictBase) -> None:
