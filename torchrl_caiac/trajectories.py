@@ -23,6 +23,7 @@ __all__ = [
     "STEPS_KEY",
     "TrajectoryCache",
     "TrajectoryIndex",
+    "end_flags",
     "flat_rows",
     "trajectory_index",
 ]
@@ -236,6 +237,48 @@ def trajectory_index(
     return _ordered(row, ends, oldest * streams)
 
 
+def end_flags(
+    data: TensorDictBase, done_key: NestedKey, length: int | None = None
+) -> torch.Tensor | None:
+    """Returns where a trajectory ends.
+
+    Args:
+        data (TensorDictBase): transitions ``[T]``.
+        done_key (NestedKey): the end flags. If the data lack them, ``"terminated"`` and
+            ``"truncated"`` beside this key are used.
+        length (int, optional): the number of rows to read. Defaults to all.
+
+    Returns:
+        torch.Tensor, optional: bool ``[length]``; ``None`` if the data have no flags.
+
+    Raises:
+        TypeError: an entry is not a tensor.
+        ValueError: an entry does not have one value for each row.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.trajectories import end_flags
+        >>> flags = {"truncated": torch.tensor([[False], [True]])}
+        >>> end_flags(TensorDict({"next": flags}, [2]), ("next", "done"))
+        tensor([False,  True])
+    """
+    length = len(data) if length is None else length
+    found = data.get(done_key, None)
+    done = None if found is None else _flat(found, length, done_key).bool()
+    if found is None:
+        parents = path(done_key)[:-1]
+        for name in _PARTS_OF_DONE:
+            part = data.get((*parents, name), None)
+            if part is not None:
+                flags = _flat(part, length, (*parents, name)).bool()
+                done = flags if done is None else done | flags
+    steps = data.get(STEPS_KEY, None)
+    if done is not None and steps is not None:
+        done = done & (_flat(steps, length, STEPS_KEY) == 1)
+    return done
+
+
 def flat_rows(
     index: torch.Tensor | tuple[torch.Tensor, ...], storage: TensorStorage
 ) -> torch.Tensor:
@@ -440,7 +483,7 @@ def _leaves(
                 "keys=TransformKeys(trajectory=...))",
             )
         ids = _flat(ids, length, trajectory_key)
-    done = None if done_key is None else _end_flags(data, length, done_key)
+    done = None if done_key is None else end_flags(data, done_key, length)
     if done_key is not None and done is None and ids is None:
         raise missing_key(
             data,
@@ -449,25 +492,6 @@ def _leaves(
             "pass done_key= with the key of the flags",
         )
     return ids, done
-
-
-def _end_flags(
-    data: TensorDictBase, length: int, done_key: NestedKey
-) -> torch.Tensor | None:
-    """Returns where a trajectory ends, bool ``[T]``, ``None`` if the data lack it."""
-    found = data.get(done_key, None)
-    done = None if found is None else _flat(found, length, done_key).bool()
-    if found is None:
-        parents = path(done_key)[:-1]
-        for name in _PARTS_OF_DONE:
-            part = data.get((*parents, name), None)
-            if part is not None:
-                flags = _flat(part, length, (*parents, name)).bool()
-                done = flags if done is None else done | flags
-    steps = data.get(STEPS_KEY, None)
-    if done is not None and steps is not None:
-        done = done & (_flat(steps, length, STEPS_KEY) == 1)
-    return done
 
 
 def _flat(leaf: torch.Tensor, length: int, key: NestedKey | None) -> torch.Tensor:

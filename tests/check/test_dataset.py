@@ -24,6 +24,7 @@ from torchrl_caiac.modules import GaussianWorldModel
 LENGTH = 30  # rows of a trajectory
 NEXT = ("next", "observation")
 DONE = ("next", "done")
+PARTS = (("next", "terminated"), ("next", "truncated"))
 
 
 def codes(data: Any, layout: EntityLayout = LAYOUT, **kwargs: Any) -> list[str]:
@@ -263,7 +264,7 @@ def remove_rows(data: TensorDict) -> TensorDict:
 
 def merge_ids(data: TensorDict) -> None:
     data["episode"] //= 2
-    data.exclude(DONE, ("next", "terminated"), ("next", "truncated"), inplace=True)
+    data.exclude(DONE, *PARTS, inplace=True)
 
 
 def merge_ids_with_time(data: TensorDict) -> None:
@@ -496,7 +497,7 @@ def test_transitions_that_share_an_id_but_do_not_follow_each_other() -> None:
     keep = torch.arange(0, len(data), 3)  # their neighbours in time are not there
     data = reorder(clean(), keep)
     order = torch.randperm(len(data), generator=torch.Generator().manual_seed(2))
-    data = reorder(data, order).exclude(DONE)
+    data = reorder(data, order).exclude(DONE, *PARTS)
     data["episode"] = torch.arange(len(data)) // 20
     report = check_dataset(data, LAYOUT)
     assert [f.code for f in report.findings] == ["next_unrelated"]
@@ -511,8 +512,21 @@ def test_without_ids_breaks_are_ends_without_flags() -> None:
     assert report.findings[0].rows[:2] == (LENGTH - 1, 2 * LENGTH - 1)
     single = check_dataset(data[:LENGTH], LAYOUT, trajectory_key=None)
     assert single.ok and single.findings[0].code == "ends_never_set"
-    del data["next", "done"]
+    del data["next", "done"]  # "terminated" and "truncated" are there
+    assert codes(data, trajectory_key=None) == ["ends_never_set"]
+    data = data.exclude(*PARTS)
     assert codes(data, trajectory_key=None) == ["ends_missing"]
+
+
+def test_a_storage_of_several_environments_that_is_not_full() -> None:
+    columns = [clean(), clean()]
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(8 * len(columns[0]), ndim=2), dim_extend=0
+    )
+    rb.extend(torch.stack(columns, 1))
+    report = check_dataset(rb, LAYOUT)
+    assert report.num_transitions == 2 * len(columns[0])
+    assert not report.findings
 
 
 def test_full_rings_and_later_writes() -> None:

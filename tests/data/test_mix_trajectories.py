@@ -25,6 +25,8 @@ def source(lengths, *, first_id=0, id_shape=(), seed=0):
     generator = torch.Generator().manual_seed(seed)
     total = sum(lengths)
     ids = first_id + 7 * torch.arange(len(lengths)).flip(0)
+    ends = torch.zeros(total, dtype=torch.bool)
+    ends[torch.tensor(lengths).cumsum(0) - 1] = True
     return TensorDict(
         {
             "observation": {"arm": torch.randn(total, 3, generator=generator)},
@@ -32,7 +34,7 @@ def source(lengths, *, first_id=0, id_shape=(), seed=0):
             "episode": ids.repeat_interleave(torch.tensor(lengths)).view(
                 total, *id_shape
             ),
-            "next": {"done": torch.rand(total, 1, generator=generator) < 0.5},
+            "next": {"done": ends.unsqueeze(-1)},
         },
         [total],
     )
@@ -289,6 +291,16 @@ def test_bad_sources():
     named = source([2]).set("name", NonTensorData("expert", [2]))
     with pytest.raises(ValueError, match=r"'name' of source 0 is a NonTensorData"):
         mix_trajectories([named])
+
+
+def test_ids_that_come_again_after_an_end_are_other_trajectories():
+    twice = torch.cat([source([2, 3]), source([2, 3])])
+    rows = mix_trajectories([twice])
+    assert rows["episode"].unique().numel() == 4
+    ends = rows["next", "done"].flatten()
+    assert (rows["episode"].diff() != 0).tolist() == ends[:-1].tolist()
+    alone = mix_trajectories([twice], done_key=None)
+    assert alone["episode"].unique().numel() == 2
 
 
 def test_rows_of_parallel_environments_become_consecutive():

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 
 from torchrl_caiac._keys import as_key
-from torchrl_caiac._torchrl import last_written, storage_data
+from torchrl_caiac._torchrl import last_written, storage_rows
 from torchrl_caiac.check.columns import check_columns, check_goals, unowned_columns
 from torchrl_caiac.check.ends import check_end_entries, check_ends, find_ids
 from torchrl_caiac.check.entries import check_entries, goal_entries
@@ -25,14 +25,13 @@ from torchrl_caiac.check.succession import Succession, check_succession
 from torchrl_caiac.check.values import check_action, check_finite, find_padding
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._predicted_columns import checked_floor, checked_predict
-from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
+from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
 __all__ = ["check_before_use", "check_dataset"]
 
 _LOGGER = logging.getLogger("torchrl_caiac.check")
 _QUICK_ROWS = 20_000  # rows that are checked before fitting and scoring
 _MAX_STARTS = 50_000  # first states that next states are compared with
-_STEPS: NestedKey = "steps_to_next_obs"
 _TIMES: tuple[NestedKey, ...] = ("step_count", "step")
 # Findings after which others would mislead, or repeat them.
 _MISLEADING = {
@@ -337,8 +336,8 @@ class _Check:
     ) -> Succession:
         data = self.data
         steps = torch.ones(len(sample), dtype=torch.long)
-        if data.get(_STEPS, None) is not None:
-            steps = sample.read(_STEPS)[:, 0].long()
+        if data.get(STEPS_KEY, None) is not None:
+            steps = sample.read(STEPS_KEY)[:, 0].long()
         times = [key for key in self.time_keys if data.get(key, None) is not None]
         time = None
         if times and data.get(times[0])[:1].numel() == 1:
@@ -416,27 +415,28 @@ def _key(key: NestedKey | None) -> NestedKey | None:
     return None if key is None else as_key(key)
 
 
-def _rows(data: TensorDictBase | ReplayBuffer) -> tuple[TensorDictBase, int]:
-    """Returns the transitions ``[T]``, and the row that was written last."""
+def _rows(data: TensorDictBase | ReplayBuffer) -> tuple[TensorDictBase, torch.Tensor]:
+    """Returns the transitions ``[T]``, and the rows that were written last."""
     newest = None
     if isinstance(data, ReplayBuffer):
+        storage = data.storage
+        rows = storage_rows(storage)[: len(storage)]
         newest = last_written(data)
-        rows = storage_data(data.storage)
-        if rows.batch_dims == 1:
-            rows = rows[: len(data.storage)]
-    elif isinstance(data, TensorDictBase):
-        rows = data
-    else:
+        if newest is not None:
+            streams = storage.shape[1:].numel() if storage.ndim > 1 else 1
+            return rows, newest * streams + torch.arange(streams)
+    elif not isinstance(data, TensorDictBase):
         raise TypeError(
             f"data must be a TensorDict or a ReplayBuffer, got {type(data).__name__}"
         )
-    if rows.batch_dims < 1 or not rows.batch_size.numel():
+    elif data.batch_dims < 1 or not data.batch_size.numel():
         raise ValueError(
-            f"the data have the batch size {list(rows.batch_size)}, expected at least "
+            f"the data have the batch size {list(data.batch_size)}, expected at least "
             "one transition [T]"
         )
-    rows = rows if rows.batch_dims == 1 else rows.reshape(-1)
-    return rows, len(rows) - 1 if newest is None else newest
+    else:
+        rows = data if data.batch_dims == 1 else data.reshape(-1)
+    return rows, torch.tensor([len(rows) - 1])
 
 
 def _bounds(spec: Any) -> tuple[torch.Tensor, torch.Tensor] | None:

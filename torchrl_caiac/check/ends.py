@@ -10,10 +10,10 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac.check.kinds import finding
 from torchrl_caiac.check.report import Finding
+from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flags
 
 __all__ = ["check_end_entries", "check_ends", "find_ids"]
 
-_COLLECTOR_KEY: NestedKey = ("collector", "traj_ids")
 _MAX_ROWS = 2_000_000  # rows whose ids and flags are compared
 
 
@@ -33,7 +33,7 @@ def find_ids(
     if trajectory_key is None:
         return None
     known = [
-        k for k in (trajectory_key, _COLLECTOR_KEY) if data.get(k, None) is not None
+        k for k in (trajectory_key, COLLECTOR_KEY) if data.get(k, None) is not None
     ]
     return known[0] if known else None
 
@@ -58,13 +58,16 @@ def check_end_entries(
     if trajectory_key is not None and ids_key is None:
         message = f"the transitions lack the trajectory ids {trajectory_key!r}"
         findings.append(finding("ids_missing", message, key=trajectory_key))
-    has_flags = done_key is not None and data.get(done_key, None) is not None
+    has_done = done_key is not None and data.get(done_key, None) is not None
+    has_flags = has_done or (
+        done_key is not None and end_flags(data, done_key) is not None
+    )
     if ids_key is None and not has_flags:
         message = f"the transitions have no end flags {done_key!r} either"
         if trajectory_key is None:
             message = f"the transitions have neither ids nor end flags {done_key!r}"
         findings.append(finding("ends_missing", message, key=done_key))
-    for key in (ids_key, done_key if has_flags else None):
+    for key in (ids_key, done_key if has_done else None):
         if key is None:
             continue
         value = data.get(key)
@@ -88,7 +91,7 @@ def check_ends(
     trajectory_key: NestedKey | None,
     done_key: NestedKey | None,
     num_trajectories: int,
-    newest: int,
+    newest: torch.Tensor,
     continues: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None,
 ) -> list[Finding]:
     """Finds end flags that are never set, or that contradict ids or other flags.
@@ -98,7 +101,8 @@ def check_ends(
         trajectory_key (NestedKey, optional): the trajectory ids.
         done_key (NestedKey, optional): the end flags.
         num_trajectories (int): the number of trajectories.
-        newest (int): the row that was written last, whose trajectory may go on.
+        newest (torch.Tensor): int64 ``[B]``, the rows that were written last, whose
+            trajectories may go on.
         continues (callable, optional): maps rows and later rows, int64 ``[p]``, to
             whether the later state is the next state of the earlier one; ``None`` if
             next states are not known.
@@ -106,10 +110,10 @@ def check_ends(
     Returns:
         list of Finding: what was found.
     """
-    done = None if done_key is None else data.get(done_key, None)
+    done = None if done_key is None else end_flags(data, done_key)
     if done_key is None or done is None:
         return []
-    flags = done.as_subclass(torch.Tensor)[:_MAX_ROWS].cpu().reshape(-1).bool()
+    flags = done[:_MAX_ROWS].cpu()
     if len(flags) < 2:
         return []
     ids_key = find_ids(data, trajectory_key)
@@ -118,7 +122,9 @@ def check_ends(
             message = f"{done_key!r} is false in all rows"
             return [finding("ends_never_set", message, key=done_key)]
         return []
-    findings = _check_done(data, done_key, flags)
+    findings = []
+    if data.get(STEPS_KEY, None) is None:  # whose flags are those of later states
+        findings = _check_done(data, done_key, flags)
     if ids_key is None:
         return findings
     ids = data.get(ids_key).as_subclass(torch.Tensor)[:_MAX_ROWS].cpu().reshape(-1)
@@ -130,8 +136,7 @@ def check_ends(
     earlier[order[1:][same]] = order[:-1][same]
     unmarked = (later < 0) & ~flags
     unmarked[-1] = False
-    if newest < len(unmarked):
-        unmarked[newest] = False
+    unmarked[newest[newest < len(unmarked)]] = False
     inside = flags & (later >= 0)
     if not bool(unmarked.any()) and not bool(inside.any()):
         return findings

@@ -37,6 +37,7 @@ def mix_trajectories(
     seed: int = 0,
     path: str | Path | None = None,
     trajectory_key: NestedKey = "episode",
+    done_key: NestedKey | None = ("next", "done"),
     source_key: NestedKey = "source",
     source_trajectory_key: NestedKey = "source_episode",
     overwrite: bool = False,
@@ -80,6 +81,9 @@ def mix_trajectories(
             written leaf by leaf and atomically. Defaults to ``None``: in memory.
         trajectory_key (NestedKey): the key of the trajectory ids, ``[T]`` or
             ``[T, 1]``. Defaults to ``"episode"``.
+        done_key (NestedKey, optional): the end flags, which end a trajectory too where
+            the data have them; ``None`` to use the ids alone. Defaults to
+            ``("next", "done")``.
         source_key (NestedKey): see above. Defaults to ``"source"``.
         source_trajectory_key (NestedKey): see above. Defaults to ``"source_episode"``.
         overwrite (bool): whether to replace ``path`` if it exists. Defaults to
@@ -112,7 +116,8 @@ def mix_trajectories(
     check_free(path, overwrite)
     _check_sources(sources, (source_key, source_trajectory_key))
     indices = [
-        _index(source, trajectory_key, number) for number, source in enumerate(sources)
+        _index(source, trajectory_key, done_key, number)
+        for number, source in enumerate(sources)
     ]
     picks = _draw_trajectories(
         [len(index.ends) for index in indices], shares, fraction, trajectories, seed
@@ -277,7 +282,10 @@ def _fill(
 
 
 def _index(
-    source: TensorDictBase, trajectory_key: NestedKey, number: int
+    source: TensorDictBase,
+    trajectory_key: NestedKey,
+    done_key: NestedKey | None,
+    number: int,
 ) -> TrajectoryIndex:
     get_leaf(
         source,
@@ -286,7 +294,9 @@ def _index(
         "pass trajectory_key=",
     )
     try:
-        return trajectory_index(source, trajectory_key=trajectory_key, done_key=None)
+        return trajectory_index(
+            source, trajectory_key=trajectory_key, done_key=done_key
+        )
     except ValueError as error:
         raise ValueError(f"source {number}: {error}") from error
 

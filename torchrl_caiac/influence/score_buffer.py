@@ -292,6 +292,7 @@ def _one_pass(
     progress: bool,
 ) -> bool:
     """Scores all rows without a valid score; returns whether there were none."""
+    before = None if overwrite else read_record(storage, data, key)
     found = None
     if not overwrite:
         found = _existing(storage, data, scorer, index.length, layout, key, settings)
@@ -310,6 +311,8 @@ def _one_pass(
         rows = index.rows(position).cpu()
         stale, moved = ~states.valid[rows], states.moved[rows]
     with _claimed(data):
+        if not overwrite and read_record(storage, data, key) != before:
+            return False  # another process has scored: look again in the next pass
         if found is None:
             write_record(storage, data, key, settings, layout, "new")
             leaves = new_leaves(storage, key, feature_shape)

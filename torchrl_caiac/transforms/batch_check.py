@@ -19,7 +19,7 @@ from torchrl_caiac._fingerprints import (
 )
 from torchrl_caiac._keys import missing_key
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY
+from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flags
 from torchrl_caiac.transforms.checks import LateCheck
 from torchrl_caiac.transforms.keys import TransformKeys
 
@@ -28,6 +28,8 @@ __all__ = ["BatchCheck", "CheckedScores"]
 # The mean distance of a state from the next state of the row before it, in the largest
 # steps of the batch, up to which both may be recordings of one state.
 _NOISE = 0.5
+# Differences up to this share of the largest value of a column are rounding.
+_ROUNDING = 1e-6
 # The share of states that differ from the next state before them from which on both are
 # taken for separate recordings.
 _MOST = 0.5
@@ -249,9 +251,8 @@ class BatchCheck:
                 ids = ids.reshape(-1, self.window)
                 found = ids[:, 1:] != ids[:, :-1]
         if self.keys.done is not None:
-            done = td.get(self.keys.done, None)
+            done = end_flags(td, self.keys.done)
             if done is not None:
-                _check_size(done, self.keys.done, td)
                 ended = done.reshape(-1, self.window)[:, :-1].bool()
                 found = ended if found is None else found | ended
         if found is None:
@@ -313,18 +314,22 @@ class BatchCheck:
         if known is not None:
             is_valid = is_fingerprint_of(known, state, after, self.layout.names)
         state, after = state.view(-1, self.window), after.view(-1, self.window)
-        differs = state[:, 1:] != after[:, :-1]
+        exact = state[:, 1:] == after[:, :-1]
         # A sampler that pads windows repeats rows.
         repeats = (state[:, 1:] == state[:, :-1]) & (after[:, 1:] == after[:, :-1])
         here = self.layout.read(td).double()
         there = self.layout.read(td, next=True).double()
         largest = (there - here).abs().amax(0)
-        size = largest.clamp_min(1e-6 * here.abs().amax(0)).clamp_min(1e-12)
+        magnitude = torch.maximum(here.abs().amax(0), there.abs().amax(0))
+        size = largest.clamp_min(1e-6 * magnitude).clamp_min(1e-12)
         here = here.view(-1, self.window, here.shape[-1])[:, 1:]
         there = there.view(-1, self.window, there.shape[-1])[:, :-1]
-        is_near = ((here - there).abs() / size).mean(-1) <= _NOISE
-        is_noisy = is_near & (differs.double().mean() > _MOST)
-        return differs & (repeats | ~is_noisy), is_valid
+        distance = (here - there).abs()
+        # A state that was computed twice differs by rounding.
+        is_same = exact | (distance <= _ROUNDING * magnitude).all(-1)
+        is_near = (distance / size).mean(-1) <= _NOISE
+        is_noisy = is_near & ((~is_same).double().mean() > _MOST)
+        return ~exact & (repeats | ~(is_same | is_noisy)), is_valid
 
     def _explain_windows(self, td: TensorDictBase, crosses: torch.Tensor) -> None:
         window = int(crosses.any(1).nonzero()[0, 0])

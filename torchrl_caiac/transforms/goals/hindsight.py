@@ -13,7 +13,7 @@ from torchrl_caiac._keys import floating
 from torchrl_caiac._random import draw_numbers
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
-from torchrl_caiac.transforms.checks import check_number
+from torchrl_caiac.transforms.checks import LateCheck, check_number
 from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
 from torchrl_caiac.transforms.indexing import pick_rows
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -452,7 +452,9 @@ class HindsightGoal(FutureGoal):
             tensor([ True,  True, False, False])
         """
         flags = tensordict.get(self.keys.counterfactual, None)
-        if flags is not None and flags.any():
+        # On an accelerator the augmentation alone refuses the buffer, without waiting.
+        reads = flags is not None and not LateCheck.needed(flags.device)
+        if flags is not None and reads and bool(flags.any()):
             raise ValueError(
                 f"HERReplayBuffer relabels the first {tensordict.shape[0]} rows of the "
                 f"batch, {int(flags.sum())} of which are counterfactual and have no "
