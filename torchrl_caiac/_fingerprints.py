@@ -122,22 +122,26 @@ def matches(
     keys: Sequence[NestedKey],
     next_keys: Sequence[NestedKey],
     names: Sequence[str],
+    rows: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Returns which rows still have the states of their fingerprints.
 
     Args:
-        td (TensorDictBase): the rows, ``[B]``.
-        known (torch.Tensor): their fingerprints, int64 ``[B]``.
+        td (TensorDictBase): the rows, ``[T]``.
+        known (torch.Tensor): their fingerprints, int64 ``[T]``.
         keys (sequence of NestedKey): the entries of states.
         next_keys (sequence of NestedKey): the entries of next states.
         names (sequence of str): the entities, in the order of the scores.
+        rows (torch.Tensor, optional): int64 ``[B]``, the rows to compare. Defaults to
+            all of them.
 
     Returns:
         torch.Tensor: bool ``[B]``.
     """
-    left = known
+    left = known if rows is None else known.index_select(0, rows)
     for entries, factor in ((keys, 1), (next_keys, _NEXT)):
         for number, leaf in enumerate(state_leaves(td, entries)):
+            leaf = leaf if rows is None else leaf.index_select(0, rows)
             left = left - _weighted(_lanes(leaf), number, factor)
     return left >> 32 == _upper_half(tuple(names))
 

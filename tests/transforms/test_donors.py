@@ -25,6 +25,9 @@ from tests.transforms.oracle import (
 )
 from torchrl_caiac import EntityLayout
 from torchrl_caiac._torchrl import storage_data
+from torchrl_caiac.data import load_transitions, offline_buffer
+from torchrl_caiac.data.write_transitions import write_transitions
+from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 from torchrl_caiac.transforms import CAIACTransform, WindowGoal
 from torchrl_caiac.transforms import donors as module
@@ -395,3 +398,47 @@ def test_no_donor_has_a_score_of_its_state() -> None:
     out = transform(small(batch=4).sample())
     assert not out["caiac", "swapped"].any()
     assert transform.no_donor_count.tolist() == [0, 4, 4]
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_donors_that_another_process_overwrites_do_not_donate(window, tmp_path):
+    """Neither the storage nor the index of donors notices such a write."""
+    count = 60
+    state = torch.arange(count + 1.0).unsqueeze(-1).repeat(1, 2)
+    rows = TensorDict(
+        {
+            "observation": state[:-1].clone(),
+            "action": torch.zeros(count, 1),
+            "episode": torch.arange(count) // 12,
+            "next": {
+                "observation": state[1:].clone(),
+                "done": (torch.arange(count) % 12 == 11).unsqueeze(-1),
+            },
+        },
+        [count],
+    )
+    layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
+
+    class Free:
+        def __init__(self):
+            self.layout = layout
+
+        def __call__(self, td):
+            return torch.zeros(len(td), 2)
+
+    donors = offline_buffer(write_transitions(rows, tmp_path / "donors"))
+    score_buffer(donors, Free(), progress=False)
+    transform = CAIACTransform(
+        layout, counterfactual_ratio=1.0, window=window, donors=donors
+    )
+    batch = rows[: 12 * window].clone()
+    batch["caiac", "score"] = torch.zeros(len(batch), 2)
+    assert transform(batch)["caiac", "swapped"][:, 1].all()
+    # As in another process.
+    other = load_transitions(tmp_path / "donors")
+    other["observation"][24:48] = -1.0
+    for _ in range(5):
+        out = transform(batch)
+        assert (out["observation"] >= 0).all()
+    assert transform.no_donor_count[1] > 0
+    assert out["caiac", "swapped"][:, 1].all()  # the index was built again

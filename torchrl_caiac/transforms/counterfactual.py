@@ -376,6 +376,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             checked = self._batch_check.before(tensordict, scores)
             scores = checked.scores
         draw = self.generate_parameters(scores)
+        if self.check and self._donors:
+            draw = self._donors[0].verified(draw)
         out = self._swap(tensordict, plan, values, draw)
         if checked is not None:
             self._batch_check.after(out, checked, plan.states)

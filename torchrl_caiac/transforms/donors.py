@@ -10,7 +10,11 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
-from torchrl_caiac._fingerprints import fingerprint_key, rows_with_fingerprints
+from torchrl_caiac._fingerprints import (
+    fingerprint_key,
+    matches,
+    rows_with_fingerprints,
+)
 from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
@@ -306,6 +310,52 @@ class BufferDonors:
         last = trajectories.later(draw.donors, self.window - 1)
         rows = self.goals.draw_rows(last, trajectories, generator=generator)
         return draw._replace(goal_rows=rows)
+
+    def verified(self, draw: SwapDraw) -> SwapDraw:
+        """Takes back swaps whose donors were written to after they were scored.
+
+        The index of donors is built again after each write that the storage notices. It
+        does not notice those of other processes, nor those to its raw tensors. Of each
+        window, the first and the last row are compared with their fingerprints. On an
+        accelerator nothing is compared, since that would wait for it.
+
+        Args:
+            draw (SwapDraw): from :meth:`draw`.
+
+        Returns:
+            SwapDraw: the draw, without these swaps, which count as having no donor.
+        """
+        _, trajectories, data = self.index()
+        known = data.get(fingerprint_key(self.score_key), None)
+        if known is None or {known.device.type, draw.swapped.device.type} != {"cpu"}:
+            return draw
+        place = draw.swapped.nonzero()
+        rows = draw.donors[draw.swapped]
+        if not len(rows):
+            return draw
+        every = rows
+        if self.window > 1 and trajectories is not None:
+            every = torch.cat([rows, trajectories.later(rows, self.window - 1)])
+        layout = self.layout
+        is_valid = matches(
+            data,
+            plain_tensor(known),
+            layout.in_keys,
+            [layout.next(key) for key in layout.in_keys],
+            layout.names,
+            every,
+        )
+        if bool(is_valid.all()):
+            return draw
+        self.refresh()
+        is_valid = is_valid.view(-1, len(rows)).all(0)
+        lost = place[~is_valid]
+        taken_back = torch.zeros_like(draw.swapped)
+        taken_back[lost[:, 0], lost[:, 1]] = True
+        return draw._replace(
+            swapped=draw.swapped & ~taken_back,
+            no_donor=draw.no_donor + taken_back.sum(0),
+        )
 
     def apply(
         self,
