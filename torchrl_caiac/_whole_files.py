@@ -7,7 +7,7 @@ import os
 import platform
 import re
 import shutil
-import threading
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +27,9 @@ _PARTIAL = ".partial-"
 _REPLACED = "replaced-"
 # The partial files and folders of this process, as absolute paths.
 _in_use: set[Path] = set()
-_lock = threading.Lock()  # for choosing a name
+# No name is used twice: a thread that has listed the old file would remove the new one.
+# An earlier process may have had the same process number, so the time is the start.
+_numbers = count(time.time_ns())
 
 
 @contextmanager
@@ -118,11 +120,9 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 @contextmanager
 def _partial(path: Path) -> Iterator[Path]:
     """Yields a temporary path that names the process, and that nothing else uses."""
-    owner = f"{_PARTIAL}{this_process()}"
-    with _lock:
-        names = (path.with_name(f"{owner}.{n}-{path.name}") for n in count())
-        partial = next(name for name in names if name not in _in_use)
-        _in_use.add(partial)
+    owner = f"{this_process()}.{next(_numbers)}"
+    partial = path.with_name(f"{_PARTIAL}{owner}-{path.name}")
+    _in_use.add(partial)
     try:
         yield partial
     finally:
