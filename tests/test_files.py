@@ -23,6 +23,7 @@ from torchrl_caiac._files import (
     write_json,
 )
 from torchrl_caiac._torchrl import mark_memmap
+from torchrl_caiac.data.load_transitions import load_transitions
 
 
 class TestWriteJson:
@@ -151,14 +152,30 @@ class TestSafeMeta:
     def test_what_a_running_process_writes_is_not_undone(self, tmp_path, monkeypatch):
         stored(tmp_path)
         monkeypatch.setattr("torchrl_caiac._files._SECONDS_BETWEEN_TRIES", 0.0)
+        match = rf"another process is adding a leaf to {tmp_path}.*try again"
         with running(half_an_addition, tmp_path, "y", "meta.json"):
-            assert not recover_meta(tmp_path)
+            with pytest.raises(UnreadableFileError, match=match):
+                recover_meta(tmp_path)
+            with pytest.raises(UnreadableFileError, match=match):
+                load_transitions(tmp_path, keys=["action"])
             assert (tmp_path / "meta.json").read_text() == ""
         monkeypatch.setattr("platform.node", lambda: "elsewhere")
-        assert not recover_meta(tmp_path)
+        with pytest.raises(UnreadableFileError, match=match):
+            recover_meta(tmp_path)
         for copy in tmp_path.rglob("*.bak"):
             os.utime(copy, (0, 0))
         assert recover_meta(tmp_path)
+
+    def test_a_running_process_restores_after_a_killed_one(self, tmp_path, monkeypatch):
+        stored(tmp_path)
+        monkeypatch.setattr("torchrl_caiac._files._SECONDS_BETWEEN_TRIES", 0.0)
+        with running(half_an_addition, tmp_path, "y", None):
+            run_killed(half_an_addition, tmp_path, "z", "meta.json")
+            with pytest.raises(UnreadableFileError, match="try again"):
+                recover_meta(tmp_path)
+            assert (tmp_path / "meta.json").read_text() == ""
+        assert recover_meta(tmp_path)
+        assert "z" not in TensorDict.load_memmap(tmp_path)
 
     def test_copies_of_a_finished_addition_are_not_used(self, tmp_path):
         stored(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,49 @@ class TestWholeFile:
             other.write_text("other")
         assert path.read_text() == "one"
         assert list(tmp_path.iterdir()) == [path]
+
+    def test_all_spellings_of_a_path_are_the_same(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "link").symlink_to(tmp_path)
+        spellings = [Path("table.txt"), tmp_path / "table.txt", Path("link/table.txt")]
+        for one in spellings:
+            for other in spellings:
+                with whole_file(one) as partial:
+                    partial.write_text("one")
+                    with whole_file(other) as second:
+                        second.write_text("other")
+                    remove_leftovers(other)
+                    remove_leftovers_in(other.parent)
+                    assert partial.read_text() == "one"
+                assert (tmp_path / "table.txt").read_text() == "one"
+
+    def test_the_working_directory_may_change(self, tmp_path, monkeypatch):
+        (tmp_path / "other").mkdir()
+        monkeypatch.chdir(tmp_path)
+        with whole_file("table.txt") as partial, whole_folder("data") as folder:
+            partial.touch()
+            folder.mkdir()
+            monkeypatch.chdir(tmp_path / "other")
+        assert {p.name for p in tmp_path.iterdir()} == {"table.txt", "data", "other"}
+        assert not list((tmp_path / "other").iterdir())
+
+    def test_threads_do_not_meet(self, tmp_path):
+        start, seen = threading.Barrier(8), []
+
+        def write():
+            start.wait()
+            for _ in range(50):
+                with whole_file(tmp_path / "table.txt") as partial:
+                    partial.touch(exist_ok=False)  # raises if another thread has it
+            seen.append(True)
+
+        threads = [threading.Thread(target=write) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(seen) == 8
+        assert [p.name for p in tmp_path.iterdir()] == ["table.txt"]
 
     def test_a_read_only_folder_is_left_as_it_is(self, tmp_path, read_only):
         run_killed(half_a_file, tmp_path / "x" / "table.txt")

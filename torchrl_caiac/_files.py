@@ -204,13 +204,17 @@ def recover_meta(folder: str | os.PathLike[str]) -> bool:
 
     Nothing happens if every ``meta.json`` can be read. Otherwise, all of them become
     what they were before the leaf. If another process is adding a leaf right now, this
-    call waits for it.
+    call waits for it, for about a second.
 
     Args:
         folder (path): the outermost folder of a memory-mapped tensordict.
 
     Returns:
         bool: whether files were restored.
+
+    Raises:
+        UnreadableFileError: a ``meta.json`` cannot be read yet, because another process
+            is adding a leaf.
 
     Examples:
         >>> import tempfile
@@ -223,10 +227,18 @@ def recover_meta(folder: str | os.PathLike[str]) -> bool:
     for _ in range(_TRIES):
         if not _has_damage(root):
             return False
+        running = set(root.rglob(_COPIES))
         copies = _ended_copies(root)
-        if copies or not list(root.rglob(_COPIES)):
+        running.difference_update(copies)
+        if not running:
             break
         time.sleep(_SECONDS_BETWEEN_TRIES)
+    if running:
+        raise UnreadableFileError(
+            f"another process is adding a leaf to {folder}, and has left "
+            f"{sorted(copy.name for copy in running)[0]} there until it has ended: try "
+            "again"
+        )
     if not copies:
         return False
     # Of the last process, if several were killed.

@@ -7,9 +7,11 @@ import os
 import platform
 import re
 import shutil
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 __all__ = [
@@ -23,7 +25,11 @@ __all__ = [
 
 _PARTIAL = ".partial-"
 _REPLACED = "replaced-"
-_in_use: set[Path] = set()  # the partial files and folders of this process
+# The partial files and folders of this process, as absolute paths.
+_in_use: set[Path] = set()
+# No name is used twice: a thread that has listed the old file would remove the new one.
+# An earlier process may have had the same process number, so the time is the start.
+_numbers = count(time.time_ns())
 
 
 @contextmanager
@@ -52,7 +58,7 @@ def whole_file(path: str | os.PathLike[str], *, tidy: bool = True) -> Iterator[P
         ...     open(f"{folder}/results/table.txt").read()
         '42'
     """
-    path = Path(path)
+    path = _absolute(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     if tidy:
         remove_leftovers(path)
@@ -71,6 +77,10 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     The folder replaces ``path`` at the end of the block. If the block raises, the old
     folder is unchanged. Missing parent folders are created.
 
+    An old folder is moved away before the new one takes its place, so ``path`` is
+    missing for a moment. If the process is killed then, :func:`remove_leftovers` moves
+    the old folder back.
+
     Args:
         path (path): the folder to write.
 
@@ -86,7 +96,7 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         ...     os.path.isdir(f"{folder}/data")
         True
     """
-    path = Path(path)
+    path = _absolute(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path)
     with _partial(path) as partial:
@@ -110,12 +120,8 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 @contextmanager
 def _partial(path: Path) -> Iterator[Path]:
     """Yields a temporary path that names the process, and that nothing else uses."""
-    number = 0
-    while True:
-        partial = path.with_name(f"{_PARTIAL}{this_process()}.{number}-{path.name}")
-        if partial not in _in_use:
-            break
-        number += 1  # of another thread
+    owner = f"{this_process()}.{next(_numbers)}"
+    partial = path.with_name(f"{_PARTIAL}{owner}-{path.name}")
     _in_use.add(partial)
     try:
         yield partial
@@ -123,13 +129,20 @@ def _partial(path: Path) -> Iterator[Path]:
         _in_use.discard(partial)
 
 
+def _absolute(path: str | os.PathLike[str]) -> Path:
+    """Returns one path for all spellings. A link itself is replaced, not its target."""
+    path = Path(path)
+    return path.parent.resolve() / path.name
+
+
 def remove_leftovers(path: str | os.PathLike[str]) -> None:
     """Removes the partial files and folders of processes that were killed.
 
     Those of :func:`whole_file` and :func:`whole_folder` for this path are removed, and
-    those of other libraries whose names begin with them. What running processes write
-    stays, and so does what processes on other machines wrote. Nothing happens in a
-    read-only folder.
+    those of other libraries whose names begin with them. A folder that was moved away
+    and not yet replaced is moved back. What running processes write stays, and so does
+    what processes on other machines wrote. Nothing happens in a read-only folder, or in
+    one that cannot be listed.
 
     Args:
         path (path): the file or folder that was to be written.
@@ -164,11 +177,14 @@ def remove_leftovers_in(folder: str | os.PathLike[str]) -> None:
 
 
 def _remove_leftovers(folder: Path, name: str) -> None:
-    if not folder.is_dir():
+    folder = folder.resolve()
+    try:
+        found = list(folder.iterdir())
+    except OSError:  # it is missing, or must not be listed
         return
     owner = r"(?P<owner>\w+-\d+)\.\d+"
     pattern = rf"\.?{re.escape(_PARTIAL)}{owner}-(?P<name>{name})(\.\w+-\w+)*"
-    for left in folder.iterdir():
+    for left in found:
         match = re.fullmatch(pattern, left.name)
         if match is None or left in _in_use or not has_ended(match["owner"]):
             continue

@@ -397,6 +397,16 @@ class TestDigests:
         load(overwrite=True)
         assert "other data than caiac/test-v0 has" in caplog.text
 
+    @pytest.mark.parametrize("content", ["", "[]", '{"format": "other"}'])
+    def test_damaged_ones_are_replaced(self, content, tmp_path, caplog):
+        make_dataset(flat)
+        load = partial(load_minari, "caiac/test-v0", tmp_path / "rows", progress=False)
+        load()
+        (tmp_path / "rows" / "digests.json").write_text(content)
+        load(overwrite=True)
+        assert "it cannot be known what" in caplog.text
+        load_transitions(tmp_path / "rows", verify=True)
+
     def test_a_read_only_dataset(self, tmp_path, read_only):
         make_dataset(flat)
         read_only(tmp_path / "minari")
@@ -430,6 +440,9 @@ def test_arguments(tmp_path):
         load_minari(dataset, tmp_path / "rows", infos=["force"], progress=False)
     with pytest.raises(ValueError, match=r"columns range from 0 to 3.*3 columns"):
         load_minari(dataset, tmp_path / "rows", columns=[0, 3], progress=False)
+    for none in ([], (), np.array([], int)):
+        with pytest.raises(ValueError, match=r"columns is empty.*leave out columns="):
+            load_minari(dataset, tmp_path / "rows", columns=none, progress=False)
     load_minari(dataset, tmp_path / "rows", progress=False)
     with pytest.raises(FileExistsError, match="overwrite=True"):
         load_minari(dataset, tmp_path / "rows", progress=False)

@@ -342,3 +342,15 @@ class TestFolders:
         assert (found is not None) is kept
         if kept:
             assert found[0].tolist() == [-1, -1] and found[1].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("name", ["source_key", "source_trajectory_key"])
+def test_new_keys_that_would_be_lost_are_refused(name, tmp_path):
+    path = tmp_path / "data"
+    old = mix_trajectories([source([2, 3])], path=path).clone()
+    with pytest.raises(ValueError, match=r"of the mixture has one of the names.*shape"):
+        mix_trajectories(
+            [source([4])], path=path, overwrite=True, **{name: ("x", "shape")}
+        )
+    assert (load_transitions(path, verify=True) == old).all()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["data"]

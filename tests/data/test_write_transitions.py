@@ -1,11 +1,19 @@
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.killing import run_killed
+from torchrl_caiac._files import whole_folder
 from torchrl_caiac.data.load_transitions import load_transitions
-from torchrl_caiac.data.write_transitions import check_free, write_transitions
+from torchrl_caiac.data.write_transitions import (
+    check_free,
+    whole_transitions,
+    write_transitions,
+)
 
 
 def transitions(value, length=3):
@@ -36,6 +44,74 @@ def test_replaces_nothing_without_permission(tmp_path):
     assert (load_transitions(tmp_path / "data") == transitions(1.0)).all()
     check_free(None)
     check_free(tmp_path / "other")
+
+
+@pytest.mark.parametrize("exists", [True, False])
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda data: data.exclude("episode"), r"the data lacks \['episode'\].*add"),
+        (lambda data: data.exclude(("next", "done")), r"lacks \[\('next', 'done'\)\]"),
+        (lambda data: data.unsqueeze(0), r"the data has batch size \[1, 3\]"),
+        (lambda data: data[:0], r"batch size \[0\], expected \[T\] with at least one"),
+    ],
+)
+def test_what_is_not_transitions_replaces_nothing(exists, spoil, message, tmp_path):
+    path = tmp_path / "data"
+    if exists:
+        write_transitions(transitions(1.0), path)
+    with pytest.raises(ValueError, match=message):
+        write_transitions(spoil(transitions(2.0)), path, overwrite=exists)
+    if exists:
+        assert (load_transitions(path, verify=True) == transitions(1.0)).all()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["data"] * exists
+    write_transitions(transitions(3.0), path, overwrite=exists)
+
+
+@pytest.mark.parametrize("damage", ["truncate", "keys"])
+def test_a_folder_that_cannot_be_opened_replaces_nothing(damage, tmp_path):
+    path = tmp_path / "data"
+    write_transitions(transitions(1.0), path)
+    keys = ["x"] if damage == "keys" else None
+    match = r"data cannot be opened once.*data is unchanged: correct the data"
+    with (
+        pytest.raises(ValueError, match=match),
+        whole_transitions(path, keys=keys) as folder,
+    ):
+        transitions(2.0).memmap(folder)
+        if damage == "truncate":
+            os.truncate(folder / "action.memmap", 3)
+    assert (load_transitions(path, verify=True) == transitions(1.0)).all()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["data"]
+
+
+@pytest.mark.parametrize("call", ["load", "write", "check"])
+def test_a_kill_between_two_moves_loses_nothing(call, tmp_path, monkeypatch):
+    path = tmp_path / "data"
+    write_transitions(transitions(1.0), path)
+    replace = os.replace
+
+    def once(source, target):
+        replace(source, target)
+        os.kill(os.getpid(), 9)
+
+    def replacing():
+        with whole_folder(path) as folder:
+            folder.mkdir()
+        yield
+
+    monkeypatch.setattr(os, "replace", once)
+    run_killed(replacing)
+    monkeypatch.undo()
+    assert not path.exists()
+    if call == "write":
+        with pytest.raises(FileExistsError, match="overwrite=True"):
+            write_transitions(transitions(2.0), path)
+    elif call == "check":
+        with pytest.raises(FileExistsError, match="overwrite=True"):
+            check_free(path)
+    assert (load_transitions(path, verify=True) == transitions(1.0)).all()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["data"]
 
 
 def test_a_full_disk_is_an_error_and_leaves_nothing(small_disk):

@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from tqdm.auto import tqdm
 
-from torchrl_caiac._files import UnreadableFileError, reserve, whole_folder
+from torchrl_caiac._files import UnreadableFileError, reserve
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac.data.action_bounds import write_action_bounds
@@ -27,7 +27,11 @@ from torchrl_caiac.data.digests import (
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.minari_checks import episode_lengths
 from torchrl_caiac.data.minari_files import open_minari
-from torchrl_caiac.data.write_transitions import check_entries, check_free
+from torchrl_caiac.data.write_transitions import (
+    check_entries,
+    check_free,
+    whole_transitions,
+)
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -99,7 +103,8 @@ def load_minari(
         OSError: the disk is full.
         UnreadableFileError: the dataset is damaged, or opening it would run code.
         ValueError: the dataset is empty; an episode is empty, inconsistent, or has NaN,
-            infinite values, texts or objects; ``columns`` do not fit the observation.
+            infinite values, texts or objects; ``columns`` is empty or does not fit the
+            observation.
 
     Examples:
         >>> import os, tempfile
@@ -132,6 +137,11 @@ def load_minari(
         >>> folder.cleanup()
     """
     check_free(path, overwrite)
+    if columns is not None and not len(columns):
+        raise ValueError(
+            "columns is empty, expected at least one column of the observation: leave "
+            "out columns= to keep all"
+        )
     if isinstance(dataset, str):
         dataset = open_minari(dataset, download=download)
     lengths = episode_lengths(dataset)
@@ -141,13 +151,8 @@ def load_minari(
 
     left_out = {path_of(as_key(key)) for key in exclude}
     source = _source(dataset)
-    if has_digests(path) and data_source(path) != source:
-        _logger.warning(
-            "%s was written from other data than %s has now: it is replaced",
-            path,
-            dataset.id,
-        )
-    with whole_folder(path) as folder:
+    _warn_of_other_source(path, source)
+    with whole_transitions(path) as folder:
         _fill(dataset, lengths, folder, columns, infos, left_out, progress)
         write_digests(folder, source=source)
         space = dataset.action_space
@@ -155,6 +160,26 @@ def load_minari(
         if is_box and space.shape and space.is_bounded():
             write_action_bounds(folder, space.low, space.high)
     return load_transitions(path)
+
+
+def _warn_of_other_source(path: str | Path, source: Mapping[str, Any]) -> None:
+    if not has_digests(path):
+        return
+    try:
+        same = data_source(path) == source
+    except UnreadableFileError as error:
+        _logger.warning(
+            "it cannot be known what %s was written from (%s): it is replaced",
+            path,
+            error,
+        )
+        return
+    if not same:
+        _logger.warning(
+            "%s was written from other data than %s has now: it is replaced",
+            path,
+            source["dataset"],
+        )
 
 
 def _source(dataset: MinariDataset) -> dict[str, Any]:

@@ -8,15 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import UnreadableFileError, read_json, recover_meta
+from torchrl_caiac._files import (
+    UnreadableFileError,
+    read_json,
+    recover_meta,
+    remove_leftovers,
+)
 from torchrl_caiac._keys import leaf_names
 from torchrl_caiac._torchrl import file_name, mark_memmap
 from torchrl_caiac.data.digests import verify_digests
 
-__all__ = ["load_transitions"]
+__all__ = ["check_transitions", "load_transitions"]
 
 _KEYS: tuple[NestedKey, ...] = ("action", "episode", ("next", "done"))
 # What meta.json has besides the entries.
@@ -33,8 +38,9 @@ def load_transitions(
     ``TensorDict.load_memmap`` fills the missing part of a truncated file with zeros, in
     the data and on disk. This function checks the size of every file first, and reads
     nothing but tensors. The returned tensordict is flagged as memory-mapped, so that
-    leaves can be added to it. If a process was killed while it added one, the folder is
-    restored to what it was before.
+    leaves can be added to it. If a process was killed while it added one, or while it
+    replaced the folder, the folder is restored to what it was before. While another
+    process replaces it, it is missing for a moment.
 
     Args:
         path (str or Path): the folder, as written by
@@ -57,7 +63,7 @@ def load_transitions(
         FileNotFoundError: the folder does not exist, or has no digests to verify.
         UnreadableFileError: the folder is not a memory-mapped tensordict, is truncated,
             has something other than tensors (it could be a pickle, and is not read), or
-            other content than its digests.
+            other content than its digests; or another process is adding a leaf.
         ValueError: it has no rows or several batch dimensions, lacks a key, or is a
             replay buffer that was saved before it was full.
 
@@ -73,6 +79,7 @@ def load_transitions(
         torch.Size([3])
     """
     path = Path(path)
+    remove_leftovers(path)
     if not path.is_dir():
         raise FileNotFoundError(
             f"the folder {path} does not exist: create the data first, for example "
@@ -84,11 +91,7 @@ def load_transitions(
         shape = _check_folder(path, path, [], leaves)
     except RecursionError:
         raise UnreadableFileError(f"{path} is nested too deeply: {_AGAIN}") from None
-    if len(shape) != 1 or not shape[0]:
-        raise ValueError(
-            f"{path} has batch size {shape}, expected [T] with at least one row: store "
-            "flat transitions"
-        )
+    _check_batch_size(shape, str(path))
     _check_is_full(path, shape[0])
     if verify:
         verify_digests(path)
@@ -107,14 +110,53 @@ def load_transitions(
         raise UnreadableFileError(
             f"tensordict did not open {sorted(lost)} of {path}: {_AGAIN}"
         )
-    missing = [key for key in keys if data.get(key, None) is None]
-    if missing:
-        raise ValueError(
-            f"{path} lacks {missing}, it has {leaf_names(data)}: give another folder, "
-            "or pass keys="
-        )
+    check_transitions(
+        data, str(path), keys=keys, remedy="give another folder, or pass keys="
+    )
     mark_memmap(data)
     return data.lock_()
+
+
+def check_transitions(
+    data: TensorDictBase,
+    what: str = "the data",
+    *,
+    keys: Iterable[NestedKey] = _KEYS,
+    remedy: str = "add them",
+) -> None:
+    """Raises if data are not flat transitions, or lack keys.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        what (str): the data's name in the error message. Defaults to ``"the data"``.
+
+    Keyword Args:
+        keys (iterable of NestedKey): the keys that the data must have. Defaults to
+            ``"action"``, ``"episode"`` and ``("next", "done")``.
+        remedy (str): the end of the message about missing keys, which says what to do.
+
+    Raises:
+        ValueError: the data have no rows or several batch dimensions, or lack a key.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.load_transitions import check_transitions
+        >>> rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+        >>> check_transitions(rows, keys=["action"])
+    """
+    _check_batch_size(list(data.batch_size), what)
+    missing = [key for key in keys if data.get(key, None) is None]
+    if missing:
+        raise ValueError(f"{what} lacks {missing}, it has {leaf_names(data)}: {remedy}")
+
+
+def _check_batch_size(shape: list[int], what: str) -> None:
+    if len(shape) != 1 or not shape[0]:
+        raise ValueError(
+            f"{what} has batch size {shape}, expected [T] with at least one row: store "
+            "flat transitions"
+        )
 
 
 def _check_is_full(folder: Path, rows: int) -> None:

@@ -13,14 +13,18 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import reserve, whole_folder
+from torchrl_caiac._files import reserve
 from torchrl_caiac._keys import get_leaf
 from torchrl_caiac._keys import path as key_path
 from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.data.action_bounds import action_bounds, write_action_bounds
 from torchrl_caiac.data.digests import data_digest, has_digests, write_digests
 from torchrl_caiac.data.load_transitions import load_transitions
-from torchrl_caiac.data.write_transitions import check_entries, check_free
+from torchrl_caiac.data.write_transitions import (
+    check_entries,
+    check_free,
+    whole_transitions,
+)
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 
 __all__ = ["mix_trajectories"]
@@ -135,13 +139,14 @@ def mix_trajectories(
     one.set(source_trajectory_key, ids.clone())
     one.set(trajectory_key, ids.long())
     one.set(source_key, torch.zeros(1, dtype=torch.long, device=ids.device))
+    check_entries(one, "the mixture")  # the new keys too
     total = len(rows.number)
     keys = (trajectory_key, source_key, source_trajectory_key)
     if path is None:
         mixed = one.expand(total).apply(torch.empty_like)
         _fill(mixed, sources, rows, *keys)
         return mixed
-    with whole_folder(path) as folder:
+    with whole_transitions(path, keys=keys) as folder:
         stored = one.cpu().expand(total).memmap_like(folder)
         reserve(folder)
         _fill(stored, sources, rows, *keys)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
+from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import reserve, whole_folder
+from torchrl_caiac._files import remove_leftovers, reserve, whole_folder
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac.data.action_bounds import write_action_bounds
 from torchrl_caiac.data.digests import write_digests
-from torchrl_caiac.data.load_transitions import load_transitions
+from torchrl_caiac.data.load_transitions import check_transitions, load_transitions
 
-__all__ = ["check_entries", "check_free", "write_transitions"]
+__all__ = ["check_entries", "check_free", "whole_transitions", "write_transitions"]
 
 # Under these names, tensordict writes its own entries to meta.json.
 _RESERVED = {"_type", "device", "shape"}
@@ -23,6 +26,8 @@ _RESERVED = {"_type", "device", "shape"}
 
 def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> None:
     """Raises if a folder of transitions would be replaced without permission.
+
+    A folder that a killed process moved away, and did not replace, is moved back first.
 
     Args:
         path (path, optional): the folder to write. ``None``: nothing is written.
@@ -35,7 +40,10 @@ def check_free(path: str | os.PathLike[str] | None, overwrite: bool = False) -> 
         >>> from torchrl_caiac.data.write_transitions import check_free
         >>> check_free("/tmp", overwrite=True)
     """
-    if path is not None and not overwrite and Path(path).exists():
+    if path is None:
+        return
+    remove_leftovers(path)
+    if not overwrite and Path(path).exists():
         raise FileExistsError(
             f"{path} exists: open it with load_transitions, or pass overwrite=True to "
             "replace it"
@@ -72,6 +80,55 @@ def check_entries(data: TensorDictBase, what: str = "the data") -> None:
             )
 
 
+@contextmanager
+def whole_transitions(
+    path: str | os.PathLike[str], *, keys: Iterable[NestedKey] | None = None
+) -> Iterator[Path]:
+    """Context manager that writes a folder of transitions atomically.
+
+    At the end of the block, the new folder is opened as
+    :func:`~torchrl_caiac.data.load_transitions` does. Only then does it replace
+    ``path``.
+
+    Args:
+        path (path): the folder to write.
+
+    Keyword Args:
+        keys (iterable of NestedKey, optional): the keys that the transitions must have.
+            Defaults to ``None``: those of ``load_transitions``.
+
+    Yields:
+        Path: a temporary folder on the same file system, to be created in the block.
+
+    Raises:
+        ValueError: the new folder cannot be opened. ``path`` is unchanged.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.write_transitions import whole_transitions
+        >>> rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     with whole_transitions(f"{root}/data", keys=["action"]) as folder:
+        ...         _ = rows.memmap(folder)
+        ...     os.listdir(root)
+        ['data']
+    """
+    with whole_folder(path) as folder:
+        yield folder
+        try:
+            if keys is None:
+                load_transitions(folder)
+            else:
+                load_transitions(folder, keys=keys)
+        except (ValueError, FileNotFoundError) as error:
+            raise ValueError(
+                f"the data for {path} cannot be opened once they are written "
+                f"({error}); {path} is unchanged: correct the data"
+            ) from error
+
+
 def write_transitions(
     data: TensorDictBase,
     path: str | os.PathLike[str],
@@ -102,8 +159,10 @@ def write_transitions(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         OSError: the disk is full.
-        ValueError: an entry is not a tensor or has a reserved name, or
-            ``action_bounds`` are not bounds of the actions.
+        ValueError: the data have no rows or several batch dimensions, or lack
+            ``"action"``, ``"episode"`` or ``("next", "done")``; an entry is not a
+            tensor or has a reserved name; ``action_bounds`` are not bounds of the
+            actions.
 
     Examples:
         >>> import tempfile
@@ -123,10 +182,11 @@ def write_transitions(
         True
     """
     check_free(path, overwrite)
+    check_transitions(data)
     check_entries(data)
     if action_bounds is not None:
         _check_bounds(data, action_bounds)
-    with whole_folder(path) as folder:
+    with whole_transitions(path) as folder:
         stored = data.memmap_like(folder)
         reserve(folder)
         stored.update_(data)
