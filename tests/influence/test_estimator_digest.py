@@ -48,6 +48,22 @@ class Wrapped:
         return self.model(td["observation"])
 
 
+@dataclass
+class Ensemble:
+    models: object
+
+
+class Committee(nn.Module):
+    """Has settings in its repr, and models that are not registered."""
+
+    def __init__(self, models):
+        super().__init__()
+        self.models = models
+
+    def extra_repr(self):
+        return "committee"
+
+
 class Described(Plain):
     def __repr__(self):
         return "Described()"
@@ -58,6 +74,13 @@ def linear(scale):
     nn.init.constant_(model.weight, scale)
     nn.init.zeros_(model.bias)
     return model
+
+
+def long_tensor(scale):
+    """Its repr leaves out the middle."""
+    values = torch.zeros(10_000)
+    values[5_000] = scale
+    return values
 
 
 def closure(scale):
@@ -81,6 +104,18 @@ MAKERS = {
     "closure": closure,
     "default": lambda scale: lambda td, factor=scale: td["observation"] * factor,
     "method": lambda scale: Wrapped(linear(scale)).score,
+    "list in a dataclass": lambda scale: Ensemble([linear(scale)]),
+    "dict in a dataclass": lambda scale: Ensemble({"a": (linear(scale),)}),
+    "tensor in a dataclass": lambda scale: Ensemble([long_tensor(scale)]),
+    "array in a dataclass": lambda scale: Ensemble([long_tensor(scale).numpy()]),
+    "set in a dataclass": lambda scale: Ensemble({long_tensor(scale)}),
+    "tensordict": lambda scale: Ensemble(TensorDict({"a": long_tensor(scale)}, [])),
+    "object in a dataclass": lambda scale: Ensemble(Ensemble([linear(scale)])),
+    "dataclass in an object": lambda scale: Plain(Ensemble([linear(scale)])),
+    "function in a dataclass": lambda scale: Ensemble(closure(linear(scale))),
+    "list in a module": lambda scale: Committee([linear(scale)]),
+    "list in a module inside": lambda scale: nn.Sequential(Committee([linear(scale)])),
+    "array of objects": lambda scale: Plain(np.array([1, long_tensor(scale)], object)),
     "partial": lambda scale: functools.partial(torch.mul, other=linear(scale)),
 }
 
@@ -104,8 +139,69 @@ def test_the_code_of_a_function_changes_the_digest():
     assert estimator_digest(first) != estimator_digest(double)
 
 
+MODEL = linear(1.0)
+
+
+def read_global(td):
+    return MODEL(td["observation"])
+
+
+def read_nested(td):
+    return [MODEL(x) for x in td["observation"]]
+
+
+def read_in_lambda(td):
+    return (lambda x: MODEL(x))(td["observation"])
+
+
+def call_another(td):
+    return read_global(td) if len(td) else call_another(td)
+
+
+@pytest.mark.parametrize(
+    "function", [read_global, read_nested, read_in_lambda, call_another]
+)
+@pytest.mark.parametrize(
+    "value",
+    [
+        linear(2.0),
+        torch.ones(3),
+        np.ones(3),
+        lambda x: x,
+        [linear(2.0)],
+        2.0,
+    ],
+    ids=["module", "tensor", "array", "function", "list", "number"],
+)
+def test_globals_of_a_function_change_the_digest(function, value, monkeypatch):
+    before = estimator_digest(function)
+    assert estimator_digest(function) == before
+    monkeypatch.setitem(globals(), "MODEL", value)
+    assert estimator_digest(function) != before
+    monkeypatch.setitem(globals(), "MODEL", linear(1.0))
+    assert estimator_digest(function) == before
+
+
+def test_weights_of_a_global_model_change_the_digest(monkeypatch):
+    monkeypatch.setitem(globals(), "MODEL", linear(1.0))
+    before = estimator_digest(read_global)
+    nn.init.constant_(MODEL.bias, 1.0)
+    assert estimator_digest(read_global) != before
+
+
+def test_equal_values_have_one_digest_whether_or_not_they_are_one_object():
+    part = Plain([1.0])
+    shared, apart = Plain([part, part]), Plain([part, Plain([1.0])])
+    assert estimator_digest(shared) == estimator_digest(apart)
+    part = linear(1.0)
+    shared, apart = Ensemble([part, part]), Ensemble([part, linear(1.0)])
+    assert estimator_digest(shared) == estimator_digest(apart)
+
+
 def test_an_estimator_may_name_its_settings():
     assert estimator_digest(Described(1.0)) == estimator_digest(Described(2.0))
+    settings = Described([1, {"a": 1.0}]), Described([{"b": "c"}])
+    assert estimator_digest(settings[0]) == estimator_digest(settings[1])
     models = Described(linear(1.0)), Described(linear(2.0))
     assert estimator_digest(models[0]) != estimator_digest(models[1])
 
