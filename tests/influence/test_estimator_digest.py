@@ -14,7 +14,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.influence.scoring import LAYOUT, episodes
 from torchrl_caiac.influence import score_buffer
-from torchrl_caiac.influence.estimator_digest import estimator_digest
+from torchrl_caiac.influence.estimator_digest import DigestCache, estimator_digest
 
 
 class Plain:
@@ -196,6 +196,63 @@ def test_equal_values_have_one_digest_whether_or_not_they_are_one_object():
     part = linear(1.0)
     shared, apart = Ensemble([part, part]), Ensemble([part, linear(1.0)])
     assert estimator_digest(shared) == estimator_digest(apart)
+
+
+def add(model):
+    model.weight.add_(1.0)
+
+
+def train(model):
+    model.weight.grad = torch.ones_like(model.weight)
+    torch.optim.SGD(model.parameters(), 0.1).step()
+
+
+def load(model):
+    model.load_state_dict(linear(5.0).state_dict())
+
+
+def replace(model):
+    model.weight = nn.Parameter(torch.full((3, 3), 4.0))
+
+
+@pytest.mark.parametrize("change", [add, train, load, replace])
+@pytest.mark.parametrize("wrap", [lambda m: m, lambda m: Committee([m]), Ensemble])
+def test_a_cache_has_the_digest_of_the_estimator(wrap, change):
+    model, cache = linear(1.0), DigestCache()
+    estimator = wrap(model)
+    before = cache.digest(estimator)
+    assert before == cache.digest(estimator) == estimator_digest(estimator)
+    with torch.no_grad():
+        change(model)
+    assert cache.digest(estimator) == estimator_digest(estimator) != before
+
+
+def test_a_cache_notices_weights_that_take_the_place_of_others():
+    model, cache = linear(1.0), DigestCache()
+    for scale in range(50):  # freed memory is used again
+        model.weight = nn.Parameter(torch.full((3, 3), float(scale)))
+        assert cache.digest(model) == estimator_digest(model)
+
+
+def test_a_cache_reads_what_other_processes_may_write():
+    model, cache = linear(1.0).share_memory(), DigestCache()
+    cache.digest(model)
+    model.weight.data.fill_(7.0)
+    assert cache.digest(model) == estimator_digest(model)
+
+
+def test_a_cache_notices_other_settings():
+    model, cache = Module(1.0), DigestCache()
+    cache.digest(model)
+    model.scale = 2.0
+    assert cache.digest(model) == estimator_digest(model)
+
+
+def test_buffers_that_are_not_saved_change_the_digest():
+    first, second = linear(1.0), linear(1.0)
+    for i, model in enumerate((first, second)):
+        model.register_buffer("offset", torch.tensor(float(i)), persistent=False)
+    assert estimator_digest(first) != estimator_digest(second)
 
 
 def test_an_estimator_may_name_its_settings():

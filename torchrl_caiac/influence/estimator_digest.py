@@ -15,9 +15,10 @@ import torch
 from tensordict import is_tensor_collection
 from torch import nn
 
+from torchrl_caiac._torchrl import tensor_version
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["estimator_digest"]
+__all__ = ["DigestCache", "estimator_digest"]
 
 # What torch itself keeps in modules; parameters, buffers and modules are in the state.
 _OF_TORCH = frozenset(vars(nn.Module()))
@@ -62,14 +63,64 @@ def estimator_digest(estimator: Any) -> str:
     return hashlib.sha256(name + _Contents().digest(estimator)).hexdigest()
 
 
+class DigestCache:
+    """Returns digests of an estimator, and reads its weights only if they changed.
+
+    A change of a parameter or buffer is noticed by its address and by torch's count of
+    the writes to it. So a write to ``parameter.data`` in place is not noticed: write to
+    the parameter itself, under :func:`torch.no_grad`. Everything else is looked at in
+    each call. The cache is empty after pickling.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.influence.estimator_digest import DigestCache
+        >>> model, cache = torch.nn.Linear(2, 2), DigestCache()
+        >>> before = cache.digest(model)
+        >>> cache.digest(model) == before
+        True
+        >>> _ = torch.nn.init.zeros_(model.weight)
+        >>> cache.digest(model) == before
+        False
+    """
+
+    def __init__(self) -> None:
+        # With the weights, whose addresses would be used again if they were freed.
+        self._last: tuple[bytes, list[torch.Tensor], str] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns an empty cache, since addresses are those of this process."""
+        return {"_last": None}
+
+    def digest(self, estimator: Any) -> str:
+        """Returns the same as :func:`estimator_digest`.
+
+        Args:
+            estimator (callable): the estimator.
+
+        Returns:
+            str: hexadecimal SHA-256.
+        """
+        contents = _Contents(versions=True)
+        version = contents.digest(estimator)
+        if self._last is None or self._last[0] != version:
+            self._last = version, contents.weights, estimator_digest(estimator)
+        return self._last[2]
+
+
 class _Contents:
     """Digests of values, by what their behaviour depends on as far as it can be known.
 
     A value is looked at once. So values that are part of themselves have a digest, and
     equal values have the same digest, whether or not they are the same object.
+
+    Keyword Args:
+        versions (bool): weights of modules enter with their versions, instead of their
+            values, and are listed in ``weights``. Defaults to ``False``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, versions: bool = False) -> None:
+        self._versions = versions
+        self.weights: list[torch.Tensor] = []
         # With the values, whose ids would be used again if they were freed.
         self._known: dict[tuple[int, bool], tuple[Any, bytes]] = {}
 
@@ -110,10 +161,19 @@ class _Contents:
             return  # has a digest of its own
         elif isinstance(value, nn.Module):
             yield _text(value)
-            state = value.state_dict()
+            weights: dict[str, torch.Tensor] = {
+                **dict(value.named_parameters(remove_duplicate=False)),
+                **dict(value.named_buffers(remove_duplicate=False)),
+            }
+            state = {**value.state_dict(), **weights}
             for name in sorted(state):
                 yield name.encode()
-                yield self.digest(state[name])
+                version = tensor_version(weights[name]) if name in weights else None
+                if self._versions and version is not None:
+                    self.weights.append(weights[name])
+                    yield repr(version).encode()
+                else:
+                    yield self.digest(state[name])
             for name, module in value.named_modules():
                 yield name.encode()
                 described = _is_described(module)
@@ -237,6 +297,6 @@ def _pickled(value: Any) -> dict[str, Any] | None:
 
 def _all_attributes(value: Any) -> dict[str, Any]:
     slots = (getattr(kind, "__slots__", ()) for kind in type(value).__mro__)
-    names = [name for names in slots for name in np.atleast_1d(names).tolist()]
+    names = [n for own in slots for n in ((own,) if isinstance(own, str) else own)]
     found = {name: getattr(value, name) for name in names if hasattr(value, name)}
     return found | getattr(value, "__dict__", {})
