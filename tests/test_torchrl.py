@@ -273,3 +273,21 @@ def test_linear_pointwise_is_a_linear_layer(relu):
     wanted = wanted.relu() if relu else wanted
     for w in (weight, fence.packed_weight(weight)):
         torch.testing.assert_close(fence.linear_pointwise(x, w, bias, relu), wanted)
+
+
+def test_versions_count_writes():
+    tensor = torch.zeros(3)
+    versions = [fence.tensor_version(tensor)]
+    tensor.add_(1)
+    versions.append(fence.tensor_version(tensor))
+    tensor.detach()[0] = 2  # a view has the count of its base
+    versions.append(fence.tensor_version(tensor))
+    assert len(set(versions)) == 3
+    assert fence.tensor_version(tensor) == versions[-1]
+    assert fence.tensor_version(tensor.clone()) != versions[-1]
+
+
+def test_tensors_without_a_count_have_no_version():
+    with torch.inference_mode():
+        assert fence.tensor_version(torch.zeros(3)) is None
+    assert fence.tensor_version(torch.zeros(3).share_memory_()) is None

@@ -39,6 +39,7 @@ __all__ = [
     "storage_data",
     "storage_revision",
     "storage_rows",
+    "tensor_version",
     "vmap_loss",
 ]
 
@@ -333,3 +334,33 @@ def packed_weight(weight: Tensor) -> Tensor:
     """Returns a weight ``[O, I]`` in oneDNN's fastest layout, for inference."""
     packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight)
     return packed
+
+
+# --- tensors -------------------------------------------------------------------------
+
+
+def tensor_version(tensor: Tensor) -> tuple[int, int] | None:
+    """Returns a value that changes with every write to a tensor in this process.
+
+    Writes to ``tensor.data`` are not counted.
+
+    Args:
+        tensor (torch.Tensor): the tensor.
+
+    Returns:
+        tuple of int, optional: its address and the number of writes; ``None`` if they
+        are not counted (inference tensors) or if other processes may write to it.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac._torchrl import tensor_version
+        >>> tensor = torch.zeros(2)
+        >>> before = tensor_version(tensor)
+        >>> _ = tensor.add_(1)
+        >>> tensor_version(tensor) == before
+        False
+    """
+    on_cpu = tensor.device.type == "cpu"
+    if tensor.is_inference() or (on_cpu and tensor.is_shared()):
+        return None
+    return tensor.data_ptr(), int(tensor._version)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from typing import ClassVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.envs.kitchen import KitchenEnv
 from torchrl_caiac.envs.kitchen.expert import KitchenExpert
 from torchrl_caiac.influence import score_buffer
+from torchrl_caiac.influence.estimator_digest import estimator_digest
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,
     draw_actions,
@@ -195,6 +197,24 @@ class TestSimulatorInfluence:
         assert torch.equal(score[:, 1], states[:, 4].float())
         strict = self.oracle(threshold={"cup": 3.0, "ball": 1e-3})(rows)
         assert torch.equal(strict, torch.tensor([[1.0, 0, 0]]).expand(9, 3))
+
+    def test_the_state_of_the_simulator_is_no_setting(self, rows):
+        class Remembering(Table):
+            last = None
+
+            def outcomes(self, state, actions, *, horizon=1):
+                self.last = [np.array(state)]
+                return super().outcomes(state, actions, horizon=horizon)
+
+        oracle = self.oracle(Remembering)
+        before = estimator_digest(oracle)
+        oracle(rows)
+        assert estimator_digest(oracle) == before
+
+    def test_pickling_makes_a_new_simulator(self, rows):
+        oracle = self.oracle()
+        again = pickle.loads(pickle.dumps(oracle))
+        assert torch.equal(again(rows), oracle(rows))
 
     def test_processes_get_the_factory(self, rows, monkeypatch):
         calls = []

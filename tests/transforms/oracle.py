@@ -149,6 +149,9 @@ class KnownScores:
     def __repr__(self) -> str:
         return "KnownScores()"  # the same estimator, whatever it knows
 
+    def __getstate__(self) -> dict[str, object]:
+        return {}
+
 
 def score(rb: ReplayBuffer, layout: EntityLayout, key: tuple[str, ...]) -> None:
     """Replaces stored scores by the same scores with fingerprints."""

@@ -226,6 +226,11 @@ class CAI(nn.Module):
         """The entities that are scored, those of the model."""
         return self.model.layout
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether the fast mode knows which scores must be exact; else always true."""
+        return self._is_ready
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Returns the influence on each entity, without gradients.

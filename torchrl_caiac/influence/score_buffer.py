@@ -25,6 +25,7 @@ from torchrl_caiac._torchrl import (
 )
 from torchrl_caiac.check import check_before_use
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.estimator_digest import estimator_digest
 from torchrl_caiac.influence.score_leaf import (
     RowStates,
     ScoreLeaves,
@@ -40,7 +41,7 @@ from torchrl_caiac.influence.score_record import (
     settings_that_differ,
     write_record,
 )
-from torchrl_caiac.influence.scorer import Scorer, layout_of
+from torchrl_caiac.influence.scorer import Scorer, check_int, layout_of
 from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
 __all__ = ["score_buffer"]
@@ -202,17 +203,17 @@ def score_buffer(
                 [2., 4.],
                 [3., 3.]])
     """
-    _check_int("batch_size", batch_size, 1)
-    _check_int("smoothing", smoothing, 1)
-    _check_int("lookahead", lookahead, 0)
-    _check_int("every", every, 1)
+    check_int("batch_size", batch_size, 1)
+    check_int("smoothing", smoothing, 1)
+    check_int("lookahead", lookahead, 0)
+    check_int("every", every, 1)
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     key, storage = as_key(key), rb.storage
     known_to_be_memmap(storage_data(storage))
     layout = layout_of(estimator)
     settings = score_settings(
-        estimator,
+        estimator_digest(estimator),
         layout,
         smoothing=smoothing,
         lookahead=lookahead,
@@ -497,8 +498,3 @@ def _claimed(data: TensorDictBase) -> AbstractContextManager[None]:
     """Locks the folder of memory-mapped data, so that one process scores it."""
     folder = memmap_folder(data) if data.is_memmap() else None
     return nullcontext() if folder is None else claim_folder(folder)
-
-
-def _check_int(name: str, value: int, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be an int of at least {least}, got {value!r}")

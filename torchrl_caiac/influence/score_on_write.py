@@ -12,8 +12,15 @@ from tensordict.utils import NestedKey
 from torchrl_caiac._buffer_transform import BufferTransform
 from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
 from torchrl_caiac._keys import as_key, missing_key
+from torchrl_caiac.influence.cai import CAI
+from torchrl_caiac.influence.estimator_digest import DigestCache
 from torchrl_caiac.influence.score_record import score_settings, settings_digest
-from torchrl_caiac.influence.scorer import layout_of, reads_state_only, to_device_of
+from torchrl_caiac.influence.scorer import (
+    check_int,
+    layout_of,
+    reads_state_only,
+    to_device_of,
+)
 from torchrl_caiac.trajectories import STEPS_KEY
 
 __all__ = ["ScoreOnWrite"]
@@ -29,6 +36,10 @@ class ScoreOnWrite(BufferTransform):
     them if it is called with the same settings. Transitions are scored in batches, as
     they are written. Samples pass unchanged.
 
+    The estimator is no submodule: the state of the buffer does not contain its weights.
+    If they change, later transitions are scored with the new ones. A change is noticed
+    by torch's count of writes, which leaves out those to ``parameter.data``.
+
     Args:
         estimator (callable): see :func:`~torchrl_caiac.influence.score_buffer`.
 
@@ -36,15 +47,18 @@ class ScoreOnWrite(BufferTransform):
         key (NestedKey): the score leaf. Defaults to ``("caiac", "score")``.
         lookahead (int): 0 or 1, see above. Defaults to 1. It must be 0 for an estimator
             that reads more than the state.
-        batch_size (int): the number of states scored at once. Defaults to 4096.
+        batch_size (int): the number of states scored at once, at least 1. Defaults to
+            4096.
         trajectory_key (NestedKey, optional): as in ``score_buffer``. Scores do not
             depend on it, but settings do. Defaults to ``"episode"``.
         done_key (NestedKey, optional): the same. Defaults to ``("next", "done")``.
 
     Raises:
         TypeError: the estimator has no layout.
-        ValueError: an argument is out of range; transitions have next states that are
-            several steps later; an observation or a score is not finite.
+        ValueError: an argument is out of range; the estimator is a
+            :class:`~torchrl_caiac.influence.CAI` in the fast mode that has scored
+            nothing yet; transitions have next states that are several steps later; an
+            observation or a score is not finite.
 
     Examples:
         >>> import torch
@@ -89,16 +103,25 @@ class ScoreOnWrite(BufferTransform):
                 f"lookahead must be 0 or 1, got {lookahead!r}: later transitions are "
                 "not known yet. Use score_buffer for more"
             )
+        check_int("batch_size", batch_size, 1)
+        if isinstance(estimator, CAI) and not estimator.is_ready:
+            raise ValueError(
+                "the estimator is a CAI in the fast mode that has scored nothing yet, "
+                "so the first transitions written would decide which scores are exact: "
+                "use mode='exact', or score a buffer with it first"
+            )
         self.layout = layout_of(estimator)
         if lookahead and not reads_state_only(estimator, self.layout):
             raise ValueError(
                 "the estimator reads more than the state, which next states lack: use "
                 "lookahead=0"
             )
-        self.estimator = estimator
+        # In a tuple, so that torch does not register the estimator as a submodule.
+        self._estimator = (estimator,)
+        self._digests = DigestCache()
         self.key = as_key(key)
         self.lookahead = lookahead
-        self.batch_size = int(batch_size)
+        self.batch_size = batch_size
         self.trajectory_key = trajectory_key
         self.done_key = done_key
         self.in_keys_inv = [
@@ -106,6 +129,11 @@ class ScoreOnWrite(BufferTransform):
             *(self.layout.next(key) for key in self.layout.in_keys),
         ]
         self.out_keys_inv = [self.key, fingerprint_key(self.key)]
+
+    @property
+    def estimator(self) -> Callable[[TensorDictBase], torch.Tensor]:
+        """The estimator."""
+        return self._estimator[0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns a sample unchanged.
@@ -150,7 +178,7 @@ class ScoreOnWrite(BufferTransform):
                 "observations, and the model"
             )
         settings = score_settings(
-            self.estimator,
+            self._digests.digest(self.estimator),
             layout,
             smoothing=1,
             lookahead=self.lookahead,

@@ -15,7 +15,6 @@ from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 from torchrl_caiac._keys import jsonable, path
 from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence.estimator_digest import estimator_digest
 
 __all__ = [
     "layout_digest",
@@ -155,7 +154,7 @@ def settings_that_differ(before: dict[str, Any], now: dict[str, Any]) -> str:
 
 
 def score_settings(
-    estimator: Any,
+    digest: str,
     layout: EntityLayout,
     *,
     smoothing: int,
@@ -167,7 +166,7 @@ def score_settings(
     """Returns what scores depend on, apart from the data.
 
     Args:
-        estimator (callable): the estimator.
+        digest (str): that of the estimator.
         layout (EntityLayout): its entities.
 
     Keyword Args:
@@ -181,7 +180,7 @@ def score_settings(
         dict: JSON-compatible settings.
     """
     return {
-        "estimator": estimator_digest(estimator),
+        "estimator": digest,
         "layout": layout_digest(layout),
         "smoothing": smoothing,
         "lookahead": lookahead,

@@ -384,6 +384,15 @@ class SimulatorInfluence:
         self.num_workers = num_workers
         self._simulator = factory()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns all but the simulator, which the factory makes again."""
+        return {k: v for k, v in vars(self).items() if k != "_simulator"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Sets what was pickled, and makes a simulator."""
+        vars(self).update(state)
+        self._simulator = self.factory()
+
     @property
     def layout(self) -> EntityLayout:
         """The layout of the simulator."""
