@@ -36,8 +36,8 @@ def estimator_digest(estimator: Any) -> str:
 
     Its type, ``repr`` and ``state_dict`` enter the digest. So do its attributes, unless
     its class has a ``__repr__`` (a module: an ``extra_repr``) of its own, which then
-    names the settings. Models, tensors and functions in its attributes always do, with
-    their content, also those inside of containers and other objects. Of a function, the
+    names the settings. Models and tensors in its attributes always do, with their
+    content, also those inside of containers and other objects. Of a function, the
     code, the values that it has bound, and the global models, tensors, functions,
     numbers and texts that it names enter. Attributes that a ``__getstate__`` leaves
     out, such as a simulator, do not.
@@ -131,8 +131,8 @@ class _Contents:
             value (object): the value.
 
         Keyword Args:
-            models (bool): of the models, tensors and functions in it only. The digest
-                is empty if there are none.
+            models (bool): of the models and tensors in it only. The digest is
+                empty if there are none.
         """
         known = (id(value), models)
         if known not in self._known:
@@ -209,16 +209,22 @@ class _Contents:
             yield self.digest(_attributes(value), models=_is_described(value))
 
     def _models(self, value: Any) -> Iterator[bytes]:
-        """Yields the models, tensors and functions that the ``repr`` leaves out."""
+        """Yields the models and tensors that the ``repr`` leaves out."""
         if isinstance(value, (*_PLAIN, type, types.ModuleType, EntityLayout)):
             return
-        if isinstance(value, types.MethodType):
-            yield self.digest(value.__func__)
-            yield self.digest(value.__self__, models=True)
-        elif isinstance(value, (*_MODELS, *_FUNCTIONS)) or _is_tensordict(value):
-            yield self.digest(value)
+        if isinstance(value, _MODELS) or _is_tensordict(value):
+            found = self.digest(value)
+            if found != b"itself":
+                yield found
         else:
             inside = value if isinstance(value, _CONTAINERS) else _attributes(value)
+            if isinstance(value, types.MethodType):
+                inside = [value.__func__, value.__self__]
+            elif isinstance(value, functools.partial):
+                inside = [value.func, value.args, value.keywords]
+            elif isinstance(value, types.FunctionType):
+                cells = [cell.cell_contents for cell in value.__closure__ or ()]
+                inside = [cells, value.__defaults__, value.__kwdefaults__, vars(value)]
             for label, item in self._items(inside):
                 found = self.digest(item, models=True)
                 if found:
@@ -247,7 +253,7 @@ class _Contents:
                 yield self.digest(value)
             elif isinstance(value, (*_MODELS, *_FUNCTIONS, *_CONTAINERS)):
                 yield name.encode()
-                yield self.digest(value, models=True)
+                yield self.digest(value, models=not isinstance(value, _FUNCTIONS))
 
 
 def _names(code: types.CodeType) -> set[str]:
