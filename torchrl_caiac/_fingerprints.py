@@ -216,6 +216,9 @@ def state_leaves(
     """Yields the tensors of a state, always in the same order."""
     for key in keys:
         value = td.get(key, None)
+        if type(value) is torch.Tensor and value.numel():  # the usual case, quickly
+            yield value
+            continue
         if is_tensor_collection(value):
             names = sorted(value.keys(True, True), key=path)
             leaves = [value.get(name) for name in names]
@@ -232,6 +235,8 @@ def _lanes(leaf: torch.Tensor) -> torch.Tensor:
     The bits of a value are in the lower halves of lanes, so that a change of the upper
     ones, such as that of the sign, reaches half of the bits of the hash.
     """
+    if leaf.dtype is torch.float32 and leaf.ndim == 2 and leaf.is_contiguous():
+        return leaf.view(torch.int32).long()  # the usual case, quickly
     flat = leaf if leaf.ndim == 2 else leaf.reshape(len(leaf), -1)
     if flat.is_complex():
         flat = torch.view_as_real(flat).flatten(1)

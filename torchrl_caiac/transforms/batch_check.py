@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import torch
@@ -88,6 +89,7 @@ class BatchCheck:
         self.scores_name = scores_name
         self.unscored: Literal["raise", "keep"] = unscored
         self._fingerprint_key = fingerprint_key(score_key)
+        self._keys = layout.in_keys
         self._next_keys = [layout.next(key) for key in layout.in_keys]
         self._late = LateCheck()
 
@@ -111,7 +113,7 @@ class BatchCheck:
         if self.window == 1:
             if known is not None:
                 is_valid = matches(
-                    td, known, self.layout.in_keys, self._next_keys, self.layout.names
+                    td, known, self._keys, self._next_keys, self.layout.names
                 )
         else:
             crosses = self._crossings(td)
@@ -132,7 +134,9 @@ class BatchCheck:
             # A sum is finite if all its terms are.
             if not math.isfinite(scores.sum().item()):
                 self._explain_scores(scores)
-        elif not bool(is_valid.all()):  # score_buffer has checked its scores
+        elif not torch.equal(
+            is_valid, _true(len(is_valid))
+        ):  # score_buffer has checked its scores
             self._explain_scores(scores)
             self._explain_fingerprints(is_valid)
         return CheckedScores(scores, None, None, None)
@@ -362,6 +366,12 @@ class BatchCheck:
                     f"values, first in row {row} of the batch: clean the data, or "
                     "the donors' data"
                 )
+
+
+@lru_cache(maxsize=16)
+def _true(rows: int) -> torch.Tensor:
+    """Returns all true, to compare with, which is faster than ``all``."""
+    return torch.ones(rows, dtype=torch.bool)
 
 
 def _check_size(leaf: torch.Tensor, key: NestedKey | None, td: TensorDictBase) -> None:
