@@ -199,7 +199,7 @@ def test_scores_without_fingerprints_are_used_as_they_are() -> None:
     rb.append_transform(CAIACTransform(FLAT))
     rb.extend(later_rows(3))
     rb[:]
-    # What others write beside a state changes nothing.
+    # A change of other entries does not invalidate a score.
     data = scored().storage[:].clone()
     data["action"] += 1
     data["next", "reward"] += 1

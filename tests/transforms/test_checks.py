@@ -204,7 +204,7 @@ def late(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("late")
 def test_window_goals_tell_late_that_rows_are_no_windows() -> None:
     rb = buffer(FLAT, CAIACTransform, WINDOW, "batch", goals=True)
-    goals = rb._transform[0]
+    goals = rb.transform[0]
     for wrong in ([0, 1, 2, 4], [7, 8, 9, 10], [8, 9, 10, 11]):
         goals.expand(torch.tensor(wrong), {}, rb.storage)
         with pytest.raises(ValueError, match="not consecutive rows"):
@@ -252,7 +252,7 @@ def test_rows_without_scores_are_kept_on_the_gpu_without_waiting(
         swapped = batch["caiac", "swapped"].any(1).view(-1, window).any(1)
         assert not (wrong & swapped).cpu().any()
     count = [int(batch[key].flatten(1).isnan().any(1).sum()) for batch in batches]
-    assert rb._transform[0].unscored_count >= sum(count) > 0
+    assert rb.transform[0].unscored_count >= sum(count) > 0
 
 
 @pytest.mark.gpu
