@@ -125,7 +125,7 @@ def test_the_environment_of_a_dataset_is_not_run(root, tmp_path):
         load_minari(ID, tmp_path / "rows", progress=False)
     assert not marker.exists()
     # Minari itself runs it, and then misses an environment.
-    with pytest.raises(TypeError, match="must inherit from the gymnasium.Env"):
+    with pytest.raises(TypeError, match=r"must inherit from the gymnasium\.Env"):
         minari.MinariDataset(data(root))
     assert marker.is_dir()
 
