@@ -51,7 +51,8 @@ class CAIACTransform(CounterfactualTransform):
     state, which is compared in every batch. Rows that were written later, by whatever
     process, raise an error (see ``unscored``) until ``score_buffer`` is called again.
     So append this transform before others that change the state. Scores that you wrote
-    yourself, without fingerprints, are used as they are.
+    yourself, without fingerprints, are used as they are: whoever writes other rows over
+    them must write their scores too.
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
