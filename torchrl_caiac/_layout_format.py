@@ -19,6 +19,8 @@ _VERSION = 1
 _KEYS = {"format", "version", "entities", "flat", "goal", "achieved", "fixed"}
 _KEYS |= {"next_key"}
 _MOST_COLUMNS = 2**31 - 1
+# Written only where they are given, so that digests of other layouts stay the same.
+_UNITS = {"positions", "variance_floor"}
 # The keys that only flat layouts have.
 _FLAT_KEYS = ("observation_key", "desired_goal_key", "achieved_goal_key")
 
@@ -56,6 +58,9 @@ def layout_to_dict(layout: EntityLayout) -> dict[str, Any]:
     }
     if layout.is_flat:
         content |= {key: jsonable(getattr(layout, key)) for key in _FLAT_KEYS}
+    for part in sorted(_UNITS):
+        if getattr(layout, part):
+            content[part] = pairs(getattr(layout, part))
     return content
 
 
@@ -93,10 +98,10 @@ def layout_arguments(content: Any) -> tuple[bool, dict[str, Any]]:
     if not isinstance(is_flat, bool):
         raise _unexpected("flat", "true or false", is_flat)
     expected = _KEYS | set(_FLAT_KEYS if is_flat else ())
-    if content.keys() != expected:
+    if content.keys() - _UNITS != expected:
         raise ValueError(
             f"the layout lacks {sorted(expected - content.keys())} and has the unknown "
-            f"{reprlib.repr(sorted(map(str, content.keys() - expected)))}"
+            f"{reprlib.repr(sorted(map(str, content.keys() - expected - _UNITS)))}"
         )
     named = {part: _pairs(content, part) for part in ("entities", "goal", "achieved")}
     for part, pairs in named.items():
@@ -118,6 +123,13 @@ def layout_arguments(content: Any) -> tuple[bool, dict[str, Any]]:
     }
     if is_flat:
         arguments |= {key: _key(content[key], key) for key in _FLAT_KEYS}
+    if "positions" in content:
+        arguments["positions"] = {
+            name: _columns(value, f"positions of {name!r}")
+            for name, value in _pairs(content, "positions").items()
+        }
+    if "variance_floor" in content:
+        arguments["variance_floor"] = _pairs(content, "variance_floor")
     return is_flat, arguments
 
 

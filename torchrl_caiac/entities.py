@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,8 +11,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac import _columns
-from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 from torchrl_caiac._keys import as_key, floating, join
+from torchrl_caiac._layout_files import LayoutFiles
 from torchrl_caiac._layout_format import layout_arguments, layout_text, layout_to_dict
 from torchrl_caiac._layout_reading import (
     check_data,
@@ -21,11 +20,12 @@ from torchrl_caiac._layout_reading import (
     read_entities,
     read_observation,
 )
+from torchrl_caiac._layout_units import FloorArgument, entity_floors, position_columns
 
 __all__ = ["EntityLayout"]
 
 
-class EntityLayout:
+class EntityLayout(LayoutFiles):
     """The factorisation of a state into ``N`` entities (section 2 of the paper).
 
     A *flat* layout names columns of one observation tensor. A *nested* layout, created
@@ -55,11 +55,21 @@ class EntityLayout:
             to ``"desired_goal"``.
         achieved_goal_key (NestedKey): the key of the achieved goal, ``[*B, G]``.
             Defaults to ``"achieved_goal"``.
+        positions (mapping of str to iterable of int, optional): the columns of some or
+            all entities that say where they are: coordinates, joint angles. Whatever
+            looks at motion (influence by motion or distance, reports) reads these
+            alone. Defaults to ``None``: unknown.
+        variance_floor (float or mapping, optional): the standard deviation below which
+            a change of a column is noise, in the units of the data. One number, or for
+            each entity one number or one for each of its columns. World models and
+            the influence by motion use it unless they are given another. Defaults to
+            ``None``: unknown.
 
     Raises:
         ValueError: columns overlap, are negative or missing; a name in ``goal``,
             ``achieved`` or ``fixed`` is not an entity; goal and achieved columns do not
-            match.
+            match; a position is not a column of its entity; a floor is missing or not
+            positive.
         TypeError: a column is not an integer.
 
     Examples:
@@ -90,6 +100,8 @@ class EntityLayout:
         next_key: NestedKey = "next",
         desired_goal_key: NestedKey = "desired_goal",
         achieved_goal_key: NestedKey = "achieved_goal",
+        positions: Mapping[str, Iterable[int]] | None = None,
+        variance_floor: FloorArgument = None,
     ) -> None:
         self._set_common(entities, fixed, next_key)
         self.observation_key: NestedKey | None = as_key(observation_key)
@@ -104,6 +116,7 @@ class EntityLayout:
             self.goal = _columns.goal_vector_columns(goal)
         if achieved is not None:
             self.achieved = _columns.mirrored_columns(achieved, self.goal, self.columns)
+        self._set_units(positions, variance_floor)
 
     @classmethod
     def from_keys(
@@ -114,6 +127,8 @@ class EntityLayout:
         achieved: Mapping[str, NestedKey | None] | None = None,
         fixed: Iterable[str] = (),
         next_key: NestedKey = "next",
+        positions: Mapping[str, Iterable[int]] | None = None,
+        variance_floor: FloorArgument = None,
     ) -> EntityLayout:
         """Creates a nested layout: an entity is a leaf or a whole sub-tensordict.
 
@@ -130,6 +145,11 @@ class EntityLayout:
             fixed (iterable of str): entities that are never swapped. Defaults to
                 ``()``.
             next_key (NestedKey): the key of the next state. Defaults to ``"next"``.
+            positions (mapping of str to iterable of int, optional): as for flat
+                layouts, but places in the flattened features of the entity. Defaults
+                to ``None``.
+            variance_floor (float or mapping, optional): as for flat layouts, in the
+                order of the flattened features. Defaults to ``None``.
 
         Returns:
             EntityLayout: the layout.
@@ -159,6 +179,7 @@ class EntityLayout:
         _columns.check_goal_names(goal, achieved, self.names, self.fixed, "None")
         self.goal = _columns.disjoint_keys(goal or {}, "goal")
         self.achieved = _columns.disjoint_keys(achieved or {}, "achieved")
+        self._set_units(positions, variance_floor)
         return self
 
     def _set_common(
@@ -169,6 +190,14 @@ class EntityLayout:
         self.next_key = as_key(next_key)
         self._tensors: dict[Any, torch.Tensor] = {}
         self._next_keys: dict[NestedKey, NestedKey] = {}
+
+    def _set_units(
+        self,
+        positions: Mapping[str, Iterable[int]] | None,
+        variance_floor: FloorArgument,
+    ) -> None:
+        self.positions = position_columns(positions, self.names, self.columns)
+        self.variance_floor = entity_floors(variance_floor, self.names, self.columns)
 
     # --- names -------------------------------------------------------------------
 
@@ -490,7 +519,7 @@ class EntityLayout:
             self._next_keys[key] = join(self.next_key, key)
         return self._next_keys[key]
 
-    # --- saving ------------------------------------------------------------------
+    # --- saving: save and load are inherited -------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the layout as JSON-compatible values.
@@ -528,54 +557,6 @@ class EntityLayout:
         """
         is_flat, arguments = layout_arguments(content)
         return cls(**arguments) if is_flat else cls.from_keys(**arguments)
-
-    def save(self, path: str | Path) -> None:
-        """Writes the layout as JSON, atomically.
-
-        Args:
-            path (str or Path): the file. It is replaced if it exists.
-
-        Examples:
-            >>> import tempfile
-            >>> from torchrl_caiac import EntityLayout
-            >>> layout = EntityLayout({"arm": [0, 1]})
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     layout.save(f"{folder}/layout.json")
-            ...     EntityLayout.load(f"{folder}/layout.json") == layout
-            True
-        """
-        write_json(path, self.to_dict(), indent=2)
-
-    @classmethod
-    def load(cls, path: str | Path) -> EntityLayout:
-        """Reads a layout that :meth:`save` wrote.
-
-        Args:
-            path (str or Path): the file.
-
-        Returns:
-            EntityLayout: the layout.
-
-        Raises:
-            FileNotFoundError: the file does not exist.
-            UnreadableFileError: the file is truncated or does not describe a layout.
-
-        Examples:
-            >>> import tempfile
-            >>> from torchrl_caiac import EntityLayout
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     EntityLayout({"arm": [0, 1]}).save(f"{folder}/layout.json")
-            ...     EntityLayout.load(f"{folder}/layout.json").names
-            ('arm',)
-        """
-        what, remedy = "layout", "save the layout again"
-        content = read_json(path, what, remedy)
-        try:
-            return cls.from_dict(content)
-        except (ValueError, TypeError) as error:
-            raise UnreadableFileError(
-                f"{path} is not a readable {what} ({error}): {remedy}"
-            ) from error
 
     # --- comparing and showing ---------------------------------------------------
 

@@ -6,7 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["checked_floor", "checked_predict", "checked_widths"]
+__all__ = ["checked_floor", "checked_predict", "checked_widths", "layout_floor"]
+
+# 1 mm, 1 mrad.
+_DEFAULT_FLOOR = 1e-3
 
 
 def checked_widths(
@@ -106,6 +109,39 @@ def checked_predict(
     return positions
 
 
+def layout_floor(
+    layout: EntityLayout, predict: Mapping[str, tuple[int, ...]]
+) -> float | dict[str, float | Sequence[float]]:
+    """Returns the variance floor that a layout has for the predicted columns.
+
+    Args:
+        layout (EntityLayout): the entities.
+        predict (Mapping of str to tuple of int): the output of
+            :func:`checked_predict`.
+
+    Returns:
+        float or dict of str to float or sequence of float: the floors, 1e-3 if the
+        layout has none.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules._predicted_columns import layout_floor
+        >>> layout = EntityLayout({"cup": [2, 3]}, variance_floor={"cup": [0.1, 0.2]})
+        >>> layout_floor(layout, {"cup": (1,)})
+        {'cup': [0.2]}
+    """
+    if not layout.variance_floor:
+        return _DEFAULT_FLOOR
+    result: dict[str, float | Sequence[float]] = {}
+    for name, positions in predict.items():
+        floor = layout.variance_floor[name]
+        if isinstance(floor, tuple):
+            result[name] = [floor[position] for position in positions]
+        else:
+            result[name] = floor
+    return result
+
+
 def checked_floor(
     floor: float | Mapping[str, float | Sequence[float]],
     predict: Mapping[str, tuple[int, ...]],
@@ -113,7 +149,8 @@ def checked_floor(
     """Returns the variance floor of every predicted column.
 
     Args:
-        floor (float or Mapping): the argument of the model.
+        floor (float or Mapping): the argument of the model, or the output of
+            :func:`layout_floor`.
         predict (Mapping of str to tuple of int): the output of
             :func:`checked_predict`.
 

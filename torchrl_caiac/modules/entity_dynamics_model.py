@@ -20,6 +20,7 @@ from torchrl_caiac.modules._predicted_columns import (
     checked_floor,
     checked_predict,
     checked_widths,
+    layout_floor,
 )
 from torchrl_caiac.modules.running_norm import RunningNorm
 
@@ -62,9 +63,10 @@ class EntityDynamicsModel(TensorDictModuleBase):
         out_keys (sequence of NestedKey): where the prediction is written.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping): the smallest standard deviation to divide
-            targets by, in physical units. One number, or for each entity one number or
-            one for each predicted column. Defaults to ``1e-3`` (1 mm, 1 mrad).
+        variance_floor (float or Mapping, optional): the smallest standard deviation to
+            divide targets by, in the units of the data. One number, or for each entity
+            one number or one for each predicted column. Defaults to that of the layout,
+            or to ``1e-3`` (1 mm, 1 mrad) if it has none.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -106,7 +108,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey],
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] = 1e-3,
+        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(action_dim, int) or action_dim < 1:
@@ -125,6 +127,8 @@ class EntityDynamicsModel(TensorDictModuleBase):
 
         self.widths = checked_widths(layout, widths)
         self.predict = checked_predict(layout, self.widths, predict)
+        if variance_floor is None:
+            variance_floor = layout_floor(layout, self.predict)
         floor = checked_floor(variance_floor, self.predict)
         self.slices: dict[str, slice] = {}
         self.predicted: dict[str, slice] = {}

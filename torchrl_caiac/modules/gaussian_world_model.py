@@ -84,10 +84,10 @@ class GaussianWorldModel(EntityDynamicsModel):
             ``("prediction", "var")``.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping): the smallest standard deviation, in physical
-            units, of the data and of a prediction. One number, or for each entity one
-            number or one for each predicted column. Defaults to ``1e-3`` (1 mm,
-            1 mrad).
+        variance_floor (float or Mapping, optional): the smallest standard deviation,
+            in the units of the data, of the data and of a prediction. One number, or
+            for each entity one number or one for each predicted column. Defaults to
+            that of the layout, or to ``1e-3`` (1 mm, 1 mrad) if it has none.
         spectral_norm (bool): whether to normalise the hidden layers spectrally.
             Defaults to ``False``.
         max_variance (float): the largest variance, in normalised units. Defaults to
@@ -134,7 +134,7 @@ class GaussianWorldModel(EntityDynamicsModel):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey] = (("prediction", "loc"), ("prediction", "var")),
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] = 1e-3,
+        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
         spectral_norm: bool = False,
         max_variance: float = 200.0,
     ) -> None:

@@ -53,9 +53,10 @@ class TransformerWorldModel(EntityDynamicsModel):
             written. Defaults to ``("prediction", "loc")``.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping): the smallest standard deviation to divide
-            targets by, in physical units. One number, or for each entity one number or
-            one for each predicted column. Defaults to ``1e-3`` (1 mm, 1 mrad).
+        variance_floor (float or Mapping, optional): the smallest standard deviation to
+            divide targets by, in the units of the data. One number, or for each entity
+            one number or one for each predicted column. Defaults to that of the layout,
+            or to ``1e-3`` (1 mm, 1 mrad) if it has none.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -95,7 +96,7 @@ class TransformerWorldModel(EntityDynamicsModel):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey] = (("prediction", "loc"),),
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] = 1e-3,
+        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
     ) -> None:
         feedforward = width if feedforward is None else feedforward
         for name, value in (
