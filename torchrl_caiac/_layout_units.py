@@ -42,7 +42,7 @@ def position_columns(
     if positions is None:
         return {}
     check_names(positions, names, "positions")
-    result = {}
+    result: dict[str, tuple[int, ...]] = {}
     for name in names:
         if name not in positions:
             continue
@@ -100,7 +100,7 @@ def entity_floors(
         )
     result: dict[str, float | tuple[float, ...]] = {}
     for name in names:
-        value = floor[name]
+        value = given[name]
         one = not isinstance(value, Sequence) or isinstance(value, str)
         values = [value] if one else list(value)
         if any(
