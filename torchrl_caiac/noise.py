@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
+from torchrl_caiac._layout_units import position_features
 from torchrl_caiac._torchrl import storage_rows
 from torchrl_caiac.entities import EntityLayout
 
@@ -66,7 +67,8 @@ def resting_noise(
 
     The floor of a column is the largest of three numbers: the noise at rest, a tenth of
     the median change while the entity moves, and the resolution of the numbers.
-    The tolerance is the same with four times the noise.
+    The tolerance is the same with four times the noise, and at least the 99.9 %
+    quantile of the changes at rest.
 
     Args:
         data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
@@ -124,7 +126,7 @@ def resting_noise(
     )
     result = {}
     for name, where in layout.slices(rows).items():
-        columns = _position_features(layout, name, where.stop - where.start)
+        columns = position_features(layout, name, where.stop - where.start)
         result[name] = _entity(change[:, where], rounding[where], columns)
     return result
 
@@ -147,16 +149,6 @@ def _sample(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBas
     return data[torch.linspace(0, len(data) - 1, max_rows).round().long()]
 
 
-def _position_features(layout: EntityLayout, name: str, width: int) -> list[int]:
-    """Returns the features of an entity that tell whether it moves."""
-    if name not in layout.positions:
-        return list(range(width))
-    if layout.is_flat:
-        own = layout.columns[name]
-        return [own.index(column) for column in layout.positions[name]]
-    return list(layout.positions[name])
-
-
 def _entity(
     change: torch.Tensor, rounding: torch.Tensor, columns: list[int]
 ) -> EntityNoise:
@@ -169,8 +161,9 @@ def _entity(
     varies = large > resolution
     tell = [c for c in columns if bool(varies[c])]
     nan = torch.full((width,), math.nan, dtype=change.dtype)
+    rests = torch.ones(count, dtype=torch.bool)
     if not tell:
-        noise, moving, rests = change.square().mean(0).sqrt(), nan, torch.ones(count)
+        noise, moving = change.square().mean(0).sqrt(), nan
         reason = f"never moves in {count} rows"
     else:
         size = (change[:, tell] / large[tell]).amax(1)
@@ -188,11 +181,15 @@ def _entity(
     quiet = torch.where(noise.isnan(), zero, noise)
     least = torch.maximum(part, resolution)
     floor = torch.maximum(quiet, least)
+    tolerance = torch.maximum(_DEVIATIONS * quiet, least)
+    if bool(rests.any()):
+        at_rest = torch.stack([_quantile(c, _LARGE) for c in change[rests].T])
+        tolerance = torch.maximum(tolerance, at_rest)
     if not reason:
         reason = _reason(rests, noise, moving, floor, resolution, tell)
     return EntityNoise(
         floor=tuple(floor.tolist()),
-        tolerance=tuple(torch.maximum(_DEVIATIONS * quiet, least).tolist()),
+        tolerance=tuple(tolerance.tolist()),
         noise=tuple(noise.tolist()),
         moving=tuple(moving.tolist()),
         rest_share=float(rests.double().mean()),
