@@ -32,6 +32,7 @@ LAYERS = [
         "trajectories",
     },
     {"checkpoint", "data"},
+    {"layouts"},
     {"envs"},
     {"modules"},
     {"check"},
