@@ -32,7 +32,7 @@ LAYERS = [
         "trajectories",
     },
     {"checkpoint", "data"},
-    {"layouts"},
+    {"noise", "layouts"},
     {"envs"},
     {"modules"},
     {"check"},

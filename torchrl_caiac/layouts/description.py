@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import accumulate
+
 from tensordict.utils import NestedKey
 
 from torchrl_caiac.entities import EntityLayout

@@ -57,8 +57,8 @@ def _with_object(task: str) -> LayoutDescription:
         ),
         ("gripper",),
         "Columns 6 to 8 and 14 to 16 (position and velocity of the object relative to "
-        "the gripper) depend on both, so they belong to no entity and are wrong after a "
-        "swap: take them out of what a policy reads, or compute the positions again "
+        "the gripper) depend on both, so they belong to no entity and are wrong after "
+        "a swap: take them out of what a policy reads, or compute the positions again "
         "(columns 3 to 5 minus columns 0 to 2).",
     )
 
