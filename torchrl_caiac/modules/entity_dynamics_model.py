@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -14,24 +13,25 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_caiac._keys import as_key, floating, jsonable, key_from_json
+from torchrl_caiac._keys import as_key, floating, jsonable
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._predicted_columns import (
     checked_floor,
+    checked_inputs,
     checked_predict,
     checked_widths,
     layout_floor,
+    named_columns,
 )
+from torchrl_caiac.modules._saved_model import SavedModel
 from torchrl_caiac.modules.running_norm import RunningNorm
 
 __all__ = ["EntityDynamicsModel", "evaluating"]
 
-_Model = TypeVar("_Model", bound="EntityDynamicsModel")
-
 _STATISTICS_ROWS = 65_536  # rows read at once for the statistics of the targets
 
 
-class EntityDynamicsModel(TensorDictModuleBase):
+class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
     r"""The base class of models that predict how an action moves every entity.
 
     A model reads the features of all ``N`` entities (``W`` numbers,
@@ -40,9 +40,9 @@ class EntityDynamicsModel(TensorDictModuleBase):
     ``forward_tensors(state, action)`` returns a tuple of the tensors under
     :attr:`out_keys`, the expectation of the normalised target first;
     ``nll(prediction, target)`` returns what
-    :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises. They normalise
-    their inputs with ``state_norm`` and ``action_norm``, and add their own arguments
-    to :attr:`config`.
+    :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises. They read the
+    state by :meth:`read_inputs` and normalise the action by ``action_norm``, and add
+    their own arguments to :attr:`config`.
 
     The *normalised target* is by default the change of each column over the step,
     divided by its standard deviation in the data, or by the floor if that is larger.
@@ -67,6 +67,10 @@ class EntityDynamicsModel(TensorDictModuleBase):
             divide targets by, in the units of the data. One number, or for each entity
             one number or one for each predicted column. Defaults to that of the layout,
             or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        inputs (Mapping of str to iterable of int, optional): the columns of some
+            entities that the model reads, named as those of ``predict``; all columns of
+            the others are read. ``()`` leaves an entity out. The columns to predict,
+            and those that are swapped, are not affected. Defaults to all columns.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -86,9 +90,9 @@ class EntityDynamicsModel(TensorDictModuleBase):
         >>> class Linear(EntityDynamicsModel):
         ...     def __init__(self, layout, action_dim):
         ...         super().__init__(layout, action_dim, out_keys=["change"])
-        ...         self.map = torch.nn.Linear(self.state_dim, self.predict_dim)
+        ...         self.map = torch.nn.Linear(self.input_dim, self.predict_dim)
         ...     def forward_tensors(self, state, action):
-        ...         return (self.map(self.state_norm(state)),)
+        ...         return (self.map(self.read_inputs(state)),)
         ...     def nll(self, prediction, target):
         ...         return (prediction[0] - target).square().mean(-1)
         >>> model = Linear(EntityLayout({"arm": [0, 1], "cup": [2]}), 2)
@@ -109,6 +113,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
         out_keys: Sequence[NestedKey],
         target: Literal["change", "absolute"] = "change",
         variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(action_dim, int) or action_dim < 1:
@@ -127,6 +132,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
 
         self.widths = checked_widths(layout, widths)
         self.predict = checked_predict(layout, self.widths, predict)
+        self.input_positions = checked_inputs(layout, self.widths, inputs)
         if variance_floor is None:
             variance_floor = layout_floor(layout, self.predict)
         floor = checked_floor(variance_floor, self.predict)
@@ -134,18 +140,24 @@ class EntityDynamicsModel(TensorDictModuleBase):
         self.predicted: dict[str, slice] = {}
         start = stop = 0
         index: list[int] = []
+        read: list[int] = []
         for name, positions in self.predict.items():
             self.slices[name] = slice(start, start + self.widths[name])
             index += [start + position for position in positions]
+            read += [start + position for position in self.input_positions[name]]
             start += self.widths[name]
             if positions:
                 self.predicted[name] = slice(stop, stop + len(positions))
                 stop += len(positions)
         self.state_dim, self.predict_dim = start, stop
+        self.input_dim = len(read)
+        self._reads_all = read == list(range(start))
 
-        self.state_norm = RunningNorm(self.state_dim)
+        self.state_norm = RunningNorm(self.input_dim)
         self.action_norm = RunningNorm(action_dim)
         self.index: torch.Tensor
+        self.input_index: torch.Tensor
+        self.register_buffer("input_index", torch.tensor(read), persistent=False)
         self.floor: torch.Tensor
         self.target_loc: torch.Tensor
         self.target_scale: torch.Tensor
@@ -186,6 +198,31 @@ class EntityDynamicsModel(TensorDictModuleBase):
             the expectation ``[*B, P]`` first.
         """
         raise NotImplementedError(f"{type(self).__name__} has no forward_tensors")
+
+    def select_inputs(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns the columns that the model reads, not normalised.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+
+        Returns:
+            torch.Tensor: ``[*B, I]``, entities in layout order; ``I`` is
+            ``input_dim``.
+        """
+        return state if self._reads_all else state[..., self.input_index]
+
+    def read_inputs(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns the normalised columns that the model reads.
+
+        In training mode, they enter the statistics of the normalisation.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+
+        Returns:
+            torch.Tensor: ``[*B, I]``.
+        """
+        return self.state_norm(self.select_inputs(state))
 
     def nll(
         self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
@@ -481,89 +518,20 @@ class EntityDynamicsModel(TensorDictModuleBase):
     def config(self) -> dict[str, Any]:
         """The class of the model and its arguments, JSON-compatible."""
         floor = self.floor.tolist()
-        return {
+        config: dict[str, Any] = {
             "class": type(self).__name__,
             "layout": self.layout.to_dict(),
             "action_dim": self.action_dim,
             "widths": dict(self.widths),
-            "predict": {n: list(c) for n, c in self._predict_columns().items()},
+            "predict": named_columns(self.layout, self.predict),
             "action_key": jsonable(self.action_key),
             "out_keys": [jsonable(key) for key in self.out_keys],
             "target": self.target,
             "variance_floor": {n: floor[s] for n, s in self.predicted.items()},
         }
-
-    @classmethod
-    def from_config(cls: type[_Model], config: Mapping[str, Any]) -> _Model:
-        """Creates an untrained model with the arguments of another.
-
-        Args:
-            config (Mapping): the :attr:`config` of a model of this class.
-
-        Returns:
-            EntityDynamicsModel: the model.
-
-        Raises:
-            ValueError: the config is that of another class.
-
-        Examples:
-            >>> from torchrl_caiac import EntityLayout
-            >>> from torchrl_caiac.modules import GaussianWorldModel
-            >>> model = GaussianWorldModel(EntityLayout({"arm": [0, 1]}), 2, (8,))
-            >>> twin = GaussianWorldModel.from_config(model.config)
-            >>> twin.load_state_dict(model.state_dict())
-            <All keys matched successfully>
-        """
-        kwargs = dict(config)
-        named = kwargs.pop("class", None)
-        if named != cls.__name__:
-            raise ValueError(
-                f"expected the config of a {cls.__name__}, got that of a {named}: call "
-                f"{named}.from_config"
-            )
-        kwargs["layout"] = EntityLayout.from_dict(kwargs["layout"])
-        kwargs["action_key"] = key_from_json(kwargs["action_key"])
-        kwargs["out_keys"] = [key_from_json(key) for key in kwargs["out_keys"]]
-        return cls(**kwargs)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Returns the part of ``state_dict`` that is not a tensor."""
-        return {"config": json.dumps(self.config), "fitted": self.fitted}
-
-    def set_extra_state(self, state: Any) -> None:
-        """Restores the output of :meth:`get_extra_state`."""
-        self.fitted = bool(state["fitted"])
-
-    def _load_from_state_dict(
-        self, state_dict: Any, prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        # Compared before any tensor is copied, so that an error changes nothing.
-        extra = state_dict.get(f"{prefix}_extra_state")
-        if extra is not None:
-            found = json.loads(extra["config"])
-            for name, value in json.loads(json.dumps(self.config)).items():
-                if found.get(name) == value:
-                    continue
-                if name == "layout":
-                    found[name] = EntityLayout.from_dict(found[name])
-                    value = self.layout
-                raise ValueError(
-                    f"the saved world model has another {name}, saved:\n"
-                    f"{found.get(name)}\nthis model:\n{value}\nCreate the model with "
-                    f"the saved arguments ({found['class']}.from_config)"
-                )
-            if f"{prefix}action_low" not in state_dict:
-                raise ValueError(
-                    "the saved world model is of an earlier version, which did not "
-                    "record the bounds of the actions: fit it again"
-                )
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    def _predict_columns(self) -> dict[str, tuple[int, ...]]:
-        if not self.layout.is_flat:
-            return self.predict
-        columns = self.layout.columns
-        return {n: tuple(columns[n][p] for p in ps) for n, ps in self.predict.items()}
+        if not self._reads_all:
+            config["inputs"] = named_columns(self.layout, self.input_positions)
+        return config
 
 
 @contextmanager

@@ -52,9 +52,10 @@ class GaussianWorldModel(EntityDynamicsModel):
     r"""The transition model ``p(s'_j | s, a)`` of the paper, section 3.2 and A.7.
 
     A multi-layer perceptron (ReLU, orthogonal weights, zero biases) reads the features
-    of all ``N`` entities (``W`` numbers, :meth:`~torchrl_caiac.EntityLayout.read`) and
-    the action (``A``), both normalised by a running mean and variance. Separate heads
-    predict the mean and the variance of a diagonal Gaussian of ``P`` columns.
+    of all ``N`` entities (``W`` numbers, :meth:`~torchrl_caiac.EntityLayout.read`), or
+    the ``inputs`` among them, and the action (``A``), both normalised by a running mean
+    and variance. Separate heads predict the mean and the variance of a diagonal
+    Gaussian of ``P`` columns.
 
     The Gaussian describes the *normalised target*: by default the change of each
     column over the step, divided by its standard deviation in the data, or by the floor
@@ -92,6 +93,11 @@ class GaussianWorldModel(EntityDynamicsModel):
             Defaults to ``False``.
         max_variance (float): the largest variance, in normalised units. Defaults to
             ``200.0``.
+        inputs (Mapping of str to iterable of int, optional): the columns of some
+            entities that the model reads, as in
+            :class:`~torchrl_caiac.modules.EntityDynamicsModel`. A column that does not
+            help to predict, such as a joint angle next to the position of the hand, is
+            one more way to memorise the data. Defaults to all columns.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -137,6 +143,7 @@ class GaussianWorldModel(EntityDynamicsModel):
         variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
         spectral_norm: bool = False,
         max_variance: float = 200.0,
+        inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         hidden_sizes = tuple(hidden_sizes)
         if not hidden_sizes or any(
@@ -161,11 +168,12 @@ class GaussianWorldModel(EntityDynamicsModel):
             out_keys=out_keys,
             target=target,
             variance_floor=variance_floor,
+            inputs=inputs,
         )
         self.hidden_sizes = hidden_sizes
         self.spectral_norm = bool(spectral_norm)
         self.max_variance = float(max_variance)
-        sizes = [self.state_dim + action_dim, *hidden_sizes]
+        sizes = [self.input_dim + action_dim, *hidden_sizes]
         self.hidden = nn.ModuleList(
             _orthogonal(nn.Linear(n_in, n_out)) for n_in, n_out in pairwise(sizes)
         )
@@ -198,8 +206,8 @@ class GaussianWorldModel(EntityDynamicsModel):
         first: Any = self.hidden[0]
         weight = first.weight
         x = F.linear(
-            self.state_norm(state.to(dtype)), weight[:, : self.state_dim], first.bias
-        ) + F.linear(self.action_norm(action.to(dtype)), weight[:, self.state_dim :])
+            self.read_inputs(state.to(dtype)), weight[:, : self.input_dim], first.bias
+        ) + F.linear(self.action_norm(action.to(dtype)), weight[:, self.input_dim :])
         x = F.relu(x, inplace=True)
         later: Any = self.hidden[1:]
         for layer in later:
@@ -249,7 +257,7 @@ class GaussianWorldModel(EntityDynamicsModel):
             dtype = self.loc_head.weight.dtype
             first: Any = self.hidden[0]
             of_state, of_action = first.weight.split(
-                [self.state_dim, self.action_dim], -1
+                [self.input_dim, self.action_dim], -1
             )
             by_action = F.linear(
                 self.action_norm(actions.to(dtype)), of_action, first.bias
@@ -272,7 +280,7 @@ class GaussianWorldModel(EntityDynamicsModel):
                 raise ValueError(
                     f"expected states [B, {self.state_dim}], got {list(state.shape)}"
                 )
-            state = (state.to(dtype) - shift) * gain
+            state = (self.select_inputs(state).to(dtype) - shift) * gain
             size = (len(state), num_actions, 2 * self.predict_dim)
             out = state.new_empty(size)
             for own_out, own in zip(

@@ -57,6 +57,10 @@ class TransformerWorldModel(EntityDynamicsModel):
             divide targets by, in the units of the data. One number, or for each entity
             one number or one for each predicted column. Defaults to that of the layout,
             or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        inputs (Mapping of str to iterable of int, optional): the columns of some
+            entities that their tokens are projected from, as in
+            :class:`EntityDynamicsModel`, at least one of each entity. Defaults to all
+            columns.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -97,6 +101,7 @@ class TransformerWorldModel(EntityDynamicsModel):
         out_keys: Sequence[NestedKey] = (("prediction", "loc"),),
         target: Literal["change", "absolute"] = "change",
         variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         feedforward = width if feedforward is None else feedforward
         for name, value in (
@@ -127,13 +132,21 @@ class TransformerWorldModel(EntityDynamicsModel):
             out_keys=out_keys,
             target=target,
             variance_floor=variance_floor,
+            inputs=inputs,
         )
+        empty = [name for name, own in self.input_positions.items() if not own]
+        if empty:
+            raise ValueError(
+                f"inputs give {empty} no columns, so that their tokens would say "
+                "nothing of the state: give each entity at least one column"
+            )
+        self._sizes = [len(own) for own in self.input_positions.values()]
         self.heads = heads
         self.width = width
         self.feedforward = feedforward
         self.dropout = float(dropout)
         self.inputs = nn.ModuleList(
-            nn.Linear(size, width) for size in (*self.widths.values(), action_dim)
+            nn.Linear(size, width) for size in (*self._sizes, action_dim)
         )
         # Not nn.TransformerEncoder: all of its layers start with the same weights.
         self.layers = nn.ModuleList(
@@ -218,10 +231,10 @@ class TransformerWorldModel(EntityDynamicsModel):
         self._check_widths(state, action)
         last: Any = self.inputs[-1]
         dtype = last.weight.dtype
-        state = self.state_norm(state.to(dtype))
+        state = self.read_inputs(state.to(dtype))
         action = self.action_norm(action.to(dtype))
         batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
-        parts = [*state.split(list(self.widths.values()), -1), action]
+        parts = [*state.split(self._sizes, -1), action]
         tokens = [
             project(part).expand(*batch, self.width)
             for project, part in zip(self.inputs, parts, strict=True)
