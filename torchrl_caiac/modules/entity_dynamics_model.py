@@ -238,6 +238,23 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
         """
         raise NotImplementedError(f"{type(self).__name__} has no nll")
 
+    def constant_prediction(
+        self, mean: torch.Tensor, var: torch.Tensor
+    ) -> tuple[torch.Tensor, ...] | None:
+        """Returns the prediction that targets have one mean and variance everywhere.
+
+        :func:`~torchrl_caiac.fit.fit_world_model` warns if a model is no better.
+
+        Args:
+            mean (torch.Tensor): the mean of the normalised targets, ``[P]``.
+            var (torch.Tensor): their variance, ``[P]``.
+
+        Returns:
+            tuple of torch.Tensor: what :meth:`nll` reads; ``None`` (the default) if
+            the model has no such prediction.
+        """
+        return None
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the prediction of the normalised target.

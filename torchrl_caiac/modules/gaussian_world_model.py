@@ -318,6 +318,21 @@ class GaussianWorldModel(EntityDynamicsModel):
         loc, var = prediction
         return gaussian_nll(loc, var, target)
 
+    def constant_prediction(
+        self, mean: torch.Tensor, var: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Returns the Gaussian of all targets, with the variance floor.
+
+        Args:
+            mean (torch.Tensor): the mean of the normalised targets, ``[P]``.
+            var (torch.Tensor): their variance, ``[P]``.
+
+        Returns:
+            tuple of torch.Tensor: mean and variance, ``[P]`` each.
+        """
+        floor = self._variance_floor().to(var.dtype)
+        return mean, torch.maximum(var, floor).clamp_max(self.max_variance)
+
     @property
     def config(self) -> dict[str, Any]:
         """The class of the model and its arguments, JSON-compatible."""

@@ -198,6 +198,20 @@ class TransformerWorldModel(EntityDynamicsModel):
         """
         return 0.5 * (target - prediction[0]).square().mean(-1)
 
+    def constant_prediction(
+        self, mean: torch.Tensor, var: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Returns the mean of all targets, since the model predicts no variance.
+
+        Args:
+            mean (torch.Tensor): the mean of the normalised targets, ``[P]``.
+            var (torch.Tensor): their variance, ``[P]``, not used.
+
+        Returns:
+            tuple of torch.Tensor: the mean.
+        """
+        return (mean,)
+
     def attention(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Returns the attention matrices of all layers, averaged over the heads.
 
