@@ -13,16 +13,17 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer, Unbounded
 
+import torchrl_caiac._fit_rows as fit_rows
 import torchrl_caiac.fit as module
 from tests.killing import run_killed
 from torchrl_caiac._files import whole_file
-from torchrl_caiac._fit_rows import split_rows
 from torchrl_caiac.data.write_transitions import write_transitions
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
+from torchrl_caiac.noise import resting_noise
 from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss
 
 LAYOUT = EntityLayout({"arm": [0, 1], "cup": [2, 3]})
@@ -92,7 +93,9 @@ def test_learns_the_dynamics_and_where_the_cup_moves() -> None:
 def test_history_agrees_with_the_loss_on_the_held_out_rows() -> None:
     data, model = world(), make()
     history = fit(model, data, steps=40)
-    rows = split_rows(data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0))
+    rows = fit_rows.split_rows(
+        data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0)
+    )
     held_out = data[rows[1]]
     assert len(held_out) == 200
     assert not set(held_out["episode"].tolist()) & set(
@@ -220,7 +223,9 @@ def test_transformers_are_fitted_and_resumed(tmp_path: Path) -> None:
     mse = history["validation_mse"][-1]
     assert mse["arm"] < 3e-4 and mse["cup"] < 1e-3  # of 0.0033 and 0.0015
     loss = EntityDynamicsLoss(model).eval()
-    rows = split_rows(data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0))
+    rows = fit_rows.split_rows(
+        data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0)
+    )
     held_out = loss(data[rows[1]])
     torch.testing.assert_close(
         history["validation_nll"][history["best"]][-1].float(),
@@ -289,7 +294,7 @@ def test_storages_and_memory_limits_make_no_difference(
     whole, mapped, streamed = make(), make(), make()
     expected = fit(whole, data)
     fit(mapped, data.memmap(tmp_path / "data"))
-    monkeypatch.setattr(module, "_CHUNK", 37)
+    monkeypatch.setattr(fit_rows, "CHUNK", 37)
     loaded = TensorDict.load_memmap(tmp_path / "data")
     history = fit(streamed, loaded, max_memory=0)
     assert_equal(whole, mapped)
@@ -349,6 +354,29 @@ def test_statistics_that_the_model_has_are_kept() -> None:
     scale = model.target_scale.clone()
     fit(model, world(400), steps=2)
     assert torch.equal(model.target_scale, scale)
+
+
+def test_an_automatic_floor_comes_from_the_data(tmp_path: Path) -> None:
+    data, path = world(), tmp_path / "fit"
+    halves = [data[:1000], data[1000:]]
+    model = make(variance_floor="auto")
+    assert not model.has_floor and model.config["variance_floor"] == "auto"
+    fit(model, halves, steps=40, checkpoint=path)
+    noise = resting_noise(data, LAYOUT)
+    floor = [f for name in LAYOUT.names for f in noise[name].floor]
+    torch.testing.assert_close(model.floor, torch.tensor(floor, dtype=torch.float64))
+    assert model.floor_reasons == {name: noise[name].reason for name in LAYOUT.names}
+    assert "rests" in model.floor_reasons["cup"]
+    # It is part of the checkpoint, and of the state that another model loads.
+    resumed = make(variance_floor="auto")
+    fit(resumed, halves, steps=60, checkpoint=path)
+    once = make(variance_floor="auto")
+    fit(once, halves, steps=60)
+    assert_equal(resumed, once)
+    twin = GaussianWorldModel.from_config(once.config)
+    twin.load_state_dict(once.state_dict())
+    assert twin.has_floor and twin.floor_reasons == once.floor_reasons
+    assert torch.equal(twin.floor, once.floor)
 
 
 def test_denormals_are_flushed_in_the_block_only() -> None:

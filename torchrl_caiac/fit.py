@@ -201,6 +201,8 @@ def fit_world_model(
         fit.step = keeper.load(max_step=steps)
         if fit.step:
             _LOGGER.info("resuming at step %d of %s", fit.step, keeper.path)
+    if not model.has_floor:
+        model.fit_variance_floor(sources)
     if not model.fitted:
         model.fit_statistics(rows.raw_targets(train))
     model.set_action_bounds(low, high)
@@ -245,7 +247,10 @@ def fit_world_model(
 def _check(
     model: EntityDynamicsModel, sources: Sequence[TensorDictBase], key: NestedKey
 ) -> None:
-    config = model.config
+    floors = None
+    # The floor of absolute targets is not that of changes.
+    if model.has_floor and model.target == "change":
+        floors = model.entity_floors()
     for td in sources:
         if len(td):
             check_before_use(
@@ -254,11 +259,8 @@ def _check(
                 action_key=model.action_key,
                 reward_key=None,
                 trajectory_key=key,
-                # The floor of absolute targets is not that of changes.
-                variance_floor=config["variance_floor"]
-                if model.target == "change"
-                else None,
-                predict=config["predict"],
+                variance_floor=floors,
+                predict=model.config["predict"],
             )
 
 

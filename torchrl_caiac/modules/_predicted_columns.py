@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from torchrl_caiac.entities import EntityLayout
 
 __all__ = [
-    "checked_floor",
     "checked_inputs",
     "checked_predict",
     "checked_widths",
-    "layout_floor",
     "named_columns",
 ]
-
-# 1 mm, 1 mrad.
-_DEFAULT_FLOOR = 1e-3
 
 
 def checked_widths(
@@ -186,83 +181,3 @@ def _positions(
             )
         positions[name] = tuple(own.index(column) for column in columns)
     return positions
-
-
-def layout_floor(
-    layout: EntityLayout, predict: Mapping[str, tuple[int, ...]]
-) -> float | dict[str, float | Sequence[float]]:
-    """Returns the variance floor that a layout has for the predicted columns.
-
-    Args:
-        layout (EntityLayout): the entities.
-        predict (Mapping of str to tuple of int): the output of
-            :func:`checked_predict`.
-
-    Returns:
-        float or dict of str to float or sequence of float: the floors, 1e-3 if the
-        layout has none.
-
-    Examples:
-        >>> from torchrl_caiac import EntityLayout
-        >>> from torchrl_caiac.modules._predicted_columns import layout_floor
-        >>> layout = EntityLayout({"cup": [2, 3]}, variance_floor={"cup": [0.1, 0.2]})
-        >>> layout_floor(layout, {"cup": (1,)})
-        {'cup': [0.2]}
-    """
-    if not layout.variance_floor:
-        return _DEFAULT_FLOOR
-    result: dict[str, float | Sequence[float]] = {}
-    for name, positions in predict.items():
-        floor = layout.variance_floor[name]
-        if isinstance(floor, tuple):
-            result[name] = [floor[position] for position in positions]
-        else:
-            result[name] = floor
-    return result
-
-
-def checked_floor(
-    floor: float | Mapping[str, float | Sequence[float]],
-    predict: Mapping[str, tuple[int, ...]],
-) -> list[float]:
-    """Returns the variance floor of every predicted column.
-
-    Args:
-        floor (float or Mapping): the argument of the model, or the output of
-            :func:`layout_floor`.
-        predict (Mapping of str to tuple of int): the output of
-            :func:`checked_predict`.
-
-    Returns:
-        list of float: one standard deviation for each predicted column.
-
-    Raises:
-        ValueError: a floor is missing, negative or not finite.
-
-    Examples:
-        >>> from torchrl_caiac.modules._predicted_columns import checked_floor
-        >>> checked_floor({"arm": 0.1, "cup": [0.2, 0.3]}, {"arm": (0,), "cup": (0, 1)})
-        [0.1, 0.2, 0.3]
-    """
-    if isinstance(floor, Mapping):
-        wanted = [name for name, positions in predict.items() if positions]
-        if set(floor) - set(predict) or set(wanted) - set(floor):
-            raise ValueError(
-                f"variance_floor names {sorted(floor)}, expected the predicted "
-                f"entities {wanted}: give each its own floor, or one float for all"
-            )
-        per_entity = {name: floor[name] for name in wanted}
-    else:
-        per_entity = {name: floor for name, positions in predict.items() if positions}
-    floors: list[float] = []
-    for name, value in per_entity.items():
-        count = len(predict[name])
-        values = list(value) if isinstance(value, Sequence) else [value] * count
-        if len(values) != count or any(not 0 <= v < float("inf") for v in values):
-            raise ValueError(
-                f"variance_floor of entity {name!r} is {value!r}, expected a standard "
-                "deviation in physical units, at least 0, or one for each of its "
-                f"{count} predicted columns"
-            )
-        floors += [float(v) for v in values]
-    return floors

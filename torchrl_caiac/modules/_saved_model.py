@@ -21,10 +21,12 @@ class SavedModel(nn.Module):
 
     Attributes:
         fitted (bool): whether the scale of the targets is known.
+        floor_reasons (dict of str to str): how the variance floor was found.
     """
 
     layout: EntityLayout
     fitted: bool
+    floor_reasons: dict[str, str]
 
     @property
     def config(self) -> dict[str, Any]:
@@ -66,11 +68,16 @@ class SavedModel(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the part of ``state_dict`` that is not a tensor."""
-        return {"config": json.dumps(self.config), "fitted": self.fitted}
+        return {
+            "config": json.dumps(self.config),
+            "fitted": self.fitted,
+            "floor_reasons": dict(self.floor_reasons),
+        }
 
     def set_extra_state(self, state: Any) -> None:
         """Restores the output of :meth:`get_extra_state`."""
         self.fitted = bool(state["fitted"])
+        self.floor_reasons = dict(state.get("floor_reasons", {}))
 
     def _load_from_state_dict(
         self, state_dict: Any, prefix: str, *args: Any, **kwargs: Any

@@ -15,15 +15,20 @@ from torch import nn
 
 from torchrl_caiac._keys import as_key, floating, jsonable
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules._finite import FiniteChecks, owner
 from torchrl_caiac.modules._predicted_columns import (
-    checked_floor,
     checked_inputs,
     checked_predict,
     checked_widths,
-    layout_floor,
     named_columns,
 )
 from torchrl_caiac.modules._saved_model import SavedModel
+from torchrl_caiac.modules._variance_floor import (
+    FloorFromData,
+    VarianceFloor,
+    checked_floor,
+    layout_floor,
+)
 from torchrl_caiac.modules.running_norm import RunningNorm
 
 __all__ = ["EntityDynamicsModel", "evaluating"]
@@ -31,7 +36,9 @@ __all__ = ["EntityDynamicsModel", "evaluating"]
 _STATISTICS_ROWS = 65_536  # rows read at once for the statistics of the targets
 
 
-class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
+class EntityDynamicsModel(
+    FiniteChecks, FloorFromData, SavedModel, TensorDictModuleBase
+):
     r"""The base class of models that predict how an action moves every entity.
 
     A model reads the features of all ``N`` entities (``W`` numbers,
@@ -63,10 +70,11 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
         out_keys (sequence of NestedKey): where the prediction is written.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping, optional): the smallest standard deviation to
-            divide targets by, in the units of the data. One number, or for each entity
-            one number or one for each predicted column. Defaults to that of the layout,
-            or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        variance_floor (float, Mapping or "auto", optional): the smallest standard
+            deviation to divide targets by, in the units of the data. One number, or for
+            each entity one number or one for each predicted column. ``"auto"`` takes it
+            from the data, see :meth:`fit_variance_floor`. Defaults to that of the
+            layout, or to ``1e-3`` (1 mm, 1 mrad) if it has none.
         inputs (Mapping of str to iterable of int, optional): the columns of some
             entities that the model reads, named as those of ``predict``; all columns of
             the others are read. ``()`` leaves an entity out. The columns to predict,
@@ -79,6 +87,10 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
         action_low (torch.Tensor): float32 ``[A]``, the lowest action, as recorded by
             :meth:`set_action_bounds`; NaN if unknown.
         action_high (torch.Tensor): float32 ``[A]``, the highest action.
+        floor (torch.Tensor): float64 ``[P]``, the variance floor; NaN until it is
+            taken from data.
+        floor_reasons (dict of str to str): how the floor of each entity was taken from
+            data; empty if it was given.
 
     Raises:
         ValueError: an argument does not fit the layout.
@@ -112,7 +124,7 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey],
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        variance_floor: VarianceFloor = None,
         inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         super().__init__()
@@ -135,6 +147,8 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
         self.input_positions = checked_inputs(layout, self.widths, inputs)
         if variance_floor is None:
             variance_floor = layout_floor(layout, self.predict)
+        self.auto_floor = isinstance(variance_floor, str)
+        self.floor_reasons: dict[str, str] = {}
         floor = checked_floor(variance_floor, self.predict)
         self.slices: dict[str, slice] = {}
         self.predicted: dict[str, slice] = {}
@@ -381,15 +395,28 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
         """Sets the scale (and for absolute targets the centre) of the targets.
 
         The scale of a predicted column is the standard deviation of its raw target, or
-        its floor if that is larger.
+        its floor if that is larger. With ``variance_floor="auto"``, the floor is first
+        taken from the data, unless it is known.
 
         Args:
             data (TensorDictBase, torch.Tensor or iterable of them): transitions
                 ``[T]``, which are read in chunks, or raw targets ``[T, P]``.
 
         Raises:
-            ValueError: the data are empty, or a value is not finite.
+            ValueError: the data are empty, or a value is not finite; the floor is not
+                known and the data are not transitions.
         """
+        if not self.has_floor:
+            whole = [data] if isinstance(data, TensorDictBase) else data
+            if not isinstance(whole, Sequence) or any(
+                not isinstance(part, TensorDictBase) for part in whole
+            ):
+                raise ValueError(
+                    "variance_floor='auto' needs transitions to read the floor from: "
+                    "pass them, or a list of them, or call fit_variance_floor first"
+                )
+            self.fit_variance_floor(whole)
+            data = whole
         stats = RunningNorm(self.predict_dim).to(self.target_loc.device)
         for raw in self._raw_chunks(data):
             stats.update(raw)
@@ -397,7 +424,7 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
             raise ValueError("the data are empty: give some transitions")
         if not bool(torch.isfinite(stats.var).all()):
             bad = (~torch.isfinite(stats.var)).nonzero()[0].item()
-            name = self._owner(self.predicted, int(bad))
+            name = owner(self.predicted, int(bad))
             raise ValueError(
                 f"the targets of entity {name!r} are not finite: remove transitions "
                 "with NaN or infinite observations"
@@ -469,59 +496,6 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
                 td = rows[start : start + _STATISTICS_ROWS].to(device)
                 yield self.raw_targets(layout.read(td), layout.read(td, next=True))
 
-    def check_finite(
-        self, state: torch.Tensor, *, next: bool = False, first_row: int = 0
-    ) -> None:
-        """Raises an error that names entity and row if a state is not finite.
-
-        Args:
-            state (torch.Tensor): the entities' features ``[*B, W]``.
-
-        Keyword Args:
-            next (bool): whether these are next states. Defaults to ``False``.
-            first_row (int): the number of the first row. Defaults to ``0``.
-
-        Raises:
-            ValueError: a value is not finite.
-        """
-        found = _first_non_finite(state)
-        if found is None:
-            return
-        row, column, value, count = found
-        name = self._owner(self.slices, column)
-        key: Any = self.layout.observation_key or self.layout.keys[name]
-        key = self.layout.next(key) if next else key
-        raise ValueError(
-            f"{key!r} is {value} for entity {name!r} in row {first_row + row} "
-            f"({count} such rows), expected finite observations: remove or repair "
-            "these rows"
-        )
-
-    def check_finite_action(self, action: torch.Tensor, *, first_row: int = 0) -> None:
-        """Raises an error that names the row if an action is not finite.
-
-        Args:
-            action (torch.Tensor): ``[*B, A]``.
-
-        Keyword Args:
-            first_row (int): the number of the first row. Defaults to ``0``.
-
-        Raises:
-            ValueError: a value is not finite.
-        """
-        found = _first_non_finite(action)
-        if found is not None:
-            row, column, value, count = found
-            raise ValueError(
-                f"{self.action_key!r} is {value} in column {column} of row "
-                f"{first_row + row} ({count} such rows), expected finite actions: "
-                "remove or repair these rows"
-            )
-
-    @staticmethod
-    def _owner(slices: Mapping[str, slice], column: int) -> str:
-        return next(n for n, s in slices.items() if s.start <= column < s.stop)
-
     def _check_fitted(self) -> None:
         if not self.fitted:
             raise RuntimeError(
@@ -534,7 +508,6 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
     @property
     def config(self) -> dict[str, Any]:
         """The class of the model and its arguments, JSON-compatible."""
-        floor = self.floor.tolist()
         config: dict[str, Any] = {
             "class": type(self).__name__,
             "layout": self.layout.to_dict(),
@@ -544,7 +517,7 @@ class EntityDynamicsModel(SavedModel, TensorDictModuleBase):
             "action_key": jsonable(self.action_key),
             "out_keys": [jsonable(key) for key in self.out_keys],
             "target": self.target,
-            "variance_floor": {n: floor[s] for n, s in self.predicted.items()},
+            "variance_floor": "auto" if self.auto_floor else self.entity_floors(),
         }
         if not self._reads_all:
             config["inputs"] = named_columns(self.layout, self.input_positions)
@@ -561,13 +534,3 @@ def evaluating(module: nn.Module) -> Iterator[None]:
     finally:
         for part, training in modes:
             part.training = training
-
-
-def _first_non_finite(x: torch.Tensor) -> tuple[int, int, float, int] | None:
-    """Returns row, column, value, and the number of such rows; ``None`` if finite."""
-    bad = ~torch.isfinite(x).reshape(-1, x.shape[-1])
-    if not bool(bad.any()):
-        return None
-    row, column = bad.nonzero()[0].tolist()
-    value = x.reshape(-1, x.shape[-1])[row, column].item()
-    return row, column, value, int(bad.any(-1).sum())

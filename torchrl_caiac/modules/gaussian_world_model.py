@@ -15,6 +15,7 @@ from torch.nn.utils import parametrizations
 
 from torchrl_caiac._torchrl import linear_pointwise, packed_weight
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules._variance_floor import VarianceFloor
 from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
     evaluating,
@@ -85,10 +86,13 @@ class GaussianWorldModel(EntityDynamicsModel):
             ``("prediction", "var")``.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping, optional): the smallest standard deviation,
-            in the units of the data, of the data and of a prediction. One number, or
-            for each entity one number or one for each predicted column. Defaults to
-            that of the layout, or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        variance_floor (float, Mapping or "auto", optional): the smallest standard
+            deviation, in the units of the data, of the data and of a prediction. One
+            number, or for each entity one number or one for each predicted column.
+            ``"auto"`` takes it from the noise of entities at rest, see
+            :meth:`~torchrl_caiac.modules.EntityDynamicsModel.fit_variance_floor`.
+            Defaults to that of the layout, or to ``1e-3`` (1 mm, 1 mrad) if it has
+            none.
         spectral_norm (bool): whether to normalise the hidden layers spectrally.
             Defaults to ``False``.
         max_variance (float): the largest variance, in normalised units. Defaults to
@@ -140,7 +144,7 @@ class GaussianWorldModel(EntityDynamicsModel):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey] = (("prediction", "loc"), ("prediction", "var")),
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        variance_floor: VarianceFloor = None,
         spectral_norm: bool = False,
         max_variance: float = 200.0,
         inputs: Mapping[str, Iterable[int]] | None = None,
@@ -301,6 +305,11 @@ class GaussianWorldModel(EntityDynamicsModel):
         return predict
 
     def _variance_floor(self) -> torch.Tensor:
+        if not self.has_floor:
+            raise RuntimeError(
+                "the variance floor is not known: call model.fit_statistics(data), or "
+                "fit_world_model(model, data), first"
+            )
         return (self.floor / self.target_scale).square() + 1e-8
 
     def nll(

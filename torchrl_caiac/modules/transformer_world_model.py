@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules._variance_floor import VarianceFloor
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 
 __all__ = ["TransformerWorldModel"]
@@ -53,10 +54,10 @@ class TransformerWorldModel(EntityDynamicsModel):
             written. Defaults to ``("prediction", "loc")``.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping, optional): the smallest standard deviation to
-            divide targets by, in the units of the data. One number, or for each entity
-            one number or one for each predicted column. Defaults to that of the layout,
-            or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        variance_floor (float, Mapping or "auto", optional): the smallest standard
+            deviation to divide targets by, in the units of the data, as in
+            :class:`EntityDynamicsModel`. Defaults to that of the layout, or to ``1e-3``
+            (1 mm, 1 mrad) if it has none.
         inputs (Mapping of str to iterable of int, optional): the columns of some
             entities that their tokens are projected from, as in
             :class:`EntityDynamicsModel`, at least one of each entity. Defaults to all
@@ -100,7 +101,7 @@ class TransformerWorldModel(EntityDynamicsModel):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey] = (("prediction", "loc"),),
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        variance_floor: VarianceFloor = None,
         inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         feedforward = width if feedforward is None else feedforward
