@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_caiac.influence.action_coverage import ActionCoverage, action_coverage
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.distance import DistanceInfluence
@@ -24,12 +25,14 @@ from torchrl_caiac.influence.truth import (
 
 __all__ = [
     "CAI",
+    "ActionCoverage",
     "AttentionInfluence",
     "DistanceInfluence",
     "EntityReport",
     "ScoreOnWrite",
     "SimulatorInfluence",
     "TrueInfluence",
+    "action_coverage",
     "best_threshold",
     "causal_action_influence",
     "influence_report",
