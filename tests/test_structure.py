@@ -37,6 +37,8 @@ LAYERS = [
     {"modules"},
     {"check"},
     {"objectives"},
+    {"_fit_rows"},
+    {"_fit_quality"},
     {"fit"},
     {"influence"},
     {"transforms"},

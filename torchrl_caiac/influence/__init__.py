@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_caiac.influence.action_coverage import ActionCoverage, action_coverage
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.distance import DistanceInfluence
@@ -26,6 +27,7 @@ from torchrl_caiac.influence.truth import (
 
 __all__ = [
     "CAI",
+    "ActionCoverage",
     "AttentionInfluence",
     "DistanceInfluence",
     "EntityReport",
@@ -34,6 +36,7 @@ __all__ = [
     "ScoreOnWrite",
     "SimulatorInfluence",
     "TrueInfluence",
+    "action_coverage",
     "best_threshold",
     "causal_action_influence",
     "influence_report",
