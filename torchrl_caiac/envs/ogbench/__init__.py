@@ -1,0 +1,8 @@
+"""OGBench's manipulation environments: datasets, simulator and ground truth."""
+
+from __future__ import annotations
+
+from torchrl_caiac.envs.ogbench.datasets import create_ogbench_play
+from torchrl_caiac.envs.ogbench.registration import OGBENCH_ENVS, make_ogbench_env
+
+__all__ = ["OGBENCH_ENVS", "create_ogbench_play", "make_ogbench_env"]
