@@ -150,9 +150,7 @@ def create_ogbench_play(
         target.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(target) as partial:
             _write(partial, report.files)
-    _logger.info(
-        "%s: %d episodes of %d steps of %s", target, episodes, steps, name
-    )
+    _logger.info("%s: %d episodes of %d steps of %s", target, episodes, steps, name)
     return target
 
 

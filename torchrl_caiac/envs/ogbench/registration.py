@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import gymnasium
+    pass
 
 __all__ = ["OGBENCH_ENVS", "make_ogbench_env"]
 

@@ -114,9 +114,7 @@ class OGBenchSimulator:
         Returns:
             numpy.ndarray: ``[S]``, float64, a copy.
         """
-        return np.concatenate(
-            (self.data.qpos, self.data.qvel, self.button_states())
-        )
+        return np.concatenate((self.data.qpos, self.data.qvel, self.button_states()))
 
     def restore(self, state: ArrayLike) -> NDArray[np.float32]:
         """Puts the simulation into a state.
@@ -299,7 +297,7 @@ class OGBenchSimulator:
                 "state has values that are not finite at "
                 f"{np.flatnonzero(~np.isfinite(vector)).tolist()}: leave it out"
             )
-        qpos, qvel, buttons = np.split(vector, [nq, nq + nv])[:2] + [vector[nq + nv :]]
+        qpos, qvel, buttons = np.split(vector, [nq, nq + nv])
         for entity, place in self.places.items():
             if place.stop - place.start == 7 and not qpos[place][3:].any():
                 raise ValueError(
