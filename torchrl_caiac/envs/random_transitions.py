@@ -29,7 +29,6 @@ __all__ = ["RestorableEnv", "keep_array", "random_episodes", "random_transitions
 
 _ROOT = "rows"
 _STATES, _OBSERVATIONS = "states.npy", "observations.npy"
-_FLAGS = ("reward", "terminated", "truncated")
 
 
 class RestorableEnv(Protocol):
@@ -37,7 +36,8 @@ class RestorableEnv(Protocol):
 
     It may also have ``record()``, which returns the entries of the simulator's state to
     keep, a mapping of arrays; ``seed(seed)``, called before the first state of a file,
-    where observations or goals are random; and ``close()``.
+    where observations or goals are random; ``has_rewards``, ``False`` where the rewards
+    mean nothing; and ``close()``.
 
     Examples:
         >>> import gymnasium
@@ -94,9 +94,10 @@ def random_transitions(
 
     The transitions ``[T]`` with ``T = S * actions_per_state * steps`` have
     ``"observation"``, ``"action"``, ``"episode"`` (int64 ``[T]``) and, under
-    ``"next"``, the observation after the action, ``"reward"``, ``"terminated"``,
-    ``"truncated"`` and ``"done"`` (each ``[T, 1]``). If the observation is a mapping
-    with the entry ``"observation"``, its entries become entries of the root.
+    ``"next"``, the observation after the action, ``"reward"`` (unless the environment
+    has none), ``"terminated"``, ``"truncated"`` and ``"done"`` (each ``[T, 1]``). If
+    the observation is a mapping with the entry ``"observation"``, its entries become
+    entries of the root.
     Floating-point numbers become float32, except what the environment records.
 
     Args:
@@ -168,9 +169,8 @@ def random_transitions(
     key = None if info_key is None else as_key(info_key)
     arrays = {_STATES: _matrix(states, "states", None)}
     if observations is not None:
-        arrays[_OBSERVATIONS] = _matrix(
-            observations, "observations", len(arrays[_STATES])
-        )
+        count = len(arrays[_STATES])
+        arrays[_OBSERVATIONS] = _matrix(observations, "observations", count)
     spec: dict[str, Any] = {"actions": actions_per_state, "steps": steps}
     if work is not None:
         spec["env"] = _digest(env)
@@ -192,7 +192,9 @@ def random_transitions(
             description=f"random actions, {states_per_file} states at a time",
         )
         parts = [load_episode(file)[0] for file in report.files]
-    rows = torch.cat([_transitions(part[_ROOT], key) for part in parts])
+    rows: TensorDict = torch.cat(  # type: ignore[assignment]
+        [_transitions(part[_ROOT], key) for part in parts]  # type: ignore[arg-type]
+    )
     lengths = torch.from_numpy(np.concatenate([part["lengths"] for part in parts]))
     rows["episode"] = torch.arange(len(lengths)).repeat_interleave(lengths)
     if path is None:
@@ -389,10 +391,11 @@ class _Source:
             "state": before,
             "action": episode["actions"],
             "next": _part(observations, slice(1, None)),
-            "reward": episode["rewards"],
             "terminated": episode["terminations"],
             "truncated": episode["truncations"],
         }
+        if getattr(self.env, "has_rewards", True):
+            rows["reward"] = episode["rewards"]
         if "infos" in episode:
             rows["info"] = _part(episode["infos"], slice(None, -1))
         return rows
@@ -417,18 +420,19 @@ def _concatenate(trees: list[Any]) -> Any:
 
 def _transitions(rows: Mapping[str, Any], info_key: NestedKey | None) -> TensorDict:
     length = len(rows["action"])
-    flags = {key: torch.from_numpy(rows[key]).reshape(-1, 1) for key in _FLAGS}
+    flags = {
+        key: torch.from_numpy(np.array(rows[key])).reshape(length, 1)
+        for key in ("reward", "terminated", "truncated")
+        if key in rows
+    }
+    flags["done"] = flags["terminated"] | flags["truncated"]
+    if "reward" in flags:
+        flags["reward"] = flags["reward"].float()
     result = TensorDict(
         {
             **_tensors(rows["state"]),
             "action": _tensor(rows["action"]),
-            "next": {
-                **_tensors(rows["next"]),
-                "reward": flags["reward"].float(),
-                "terminated": flags["terminated"],
-                "truncated": flags["truncated"],
-                "done": flags["terminated"] | flags["truncated"],
-            },
+            "next": {**_tensors(rows["next"]), **flags},
         },
         [length],
     )

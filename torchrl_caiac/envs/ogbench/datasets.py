@@ -40,7 +40,6 @@ _STACKING = {
     "cube-double": (0.0, 0.25),
     "cube-triple": (0.05, 0.35),
     "cube-quadruple": (0.1, 0.5),
-    "cube-octuple": (0.0, 0.35),
 }
 # Metres by which a cube may leave the workspace before an episode is drawn again.
 _OUTSIDE = 0.2
@@ -168,10 +167,9 @@ def _write(partial: Path, files: Sequence[Path]) -> None:
     for file in files:
         for key, value in load_episode(file)[0].items():
             arrays.setdefault(key, []).append(value)
+    whole: dict[str, Any] = {key: np.concatenate(v) for key, v in arrays.items()}
     with partial.open("wb") as stream:  # a path would get another ending
-        np.savez_compressed(
-            stream, **{key: np.concatenate(parts) for key, parts in arrays.items()}
-        )
+        np.savez_compressed(stream, **whole)
 
 
 class _Source:

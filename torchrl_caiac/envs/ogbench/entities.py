@@ -14,7 +14,7 @@ ROBOT = "robot"
 _ROBOT_WIDTH = 19
 _CUBE_WIDTH = 9
 _BUTTON_WIDTH = 4
-_CUBES = {"single": 1, "double": 2, "triple": 3, "quadruple": 4, "octuple": 8}
+_CUBES = {"single": 1, "double": 2, "triple": 3, "quadruple": 4}
 
 
 def entity_joints(name: str) -> dict[str, str]:

