@@ -11,6 +11,8 @@ from torchrl_caiac.data.from_arrays import from_arrays
 from torchrl_caiac.data.from_replay_buffer import from_replay_buffer
 from torchrl_caiac.data.from_stream import from_stream
 from torchrl_caiac.data.load_minari import load_minari
+from torchrl_caiac.data.load_ogbench import load_ogbench
+from torchrl_caiac.data.load_robomimic import load_robomimic
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
@@ -28,6 +30,8 @@ __all__ = [
     "from_stream",
     "load_episode",
     "load_minari",
+    "load_ogbench",
+    "load_robomimic",
     "load_transitions",
     "mix_trajectories",
     "offline_buffer",
