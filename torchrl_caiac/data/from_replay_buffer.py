@@ -146,6 +146,8 @@ def from_replay_buffer(
         raise ValueError(f"unknown_next is {unknown_next!r}, expected 'drop' or 'keep'")
     data = _rows(source)
     length = len(data) if isinstance(source, TensorDictBase) else len(_storage(source))
+    if not length:
+        raise ValueError("the source is empty: give data with at least one row")
     data, whole = _without(data, exclude), data
     check_entries(data, "the source")
     if trajectory_key is not None and not _has_ids(data, trajectory_key):
