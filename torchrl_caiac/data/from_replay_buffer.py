@@ -363,7 +363,7 @@ def _transitions(
         td[name] = _plain(rows.get(key))
     if rows.get(keys.reward, None) is not None:
         reward = _one_each(rows.get(keys.reward), keys.reward, where)
-        td["next", "reward"] = _cast(reward)
+        td["next", "reward"] = _plain(reward).float()
     terminated, truncated = _flags(rows, keys.done, where)
     early = (terminated | truncated)[: -1 if ends else None]
     if early.any():
