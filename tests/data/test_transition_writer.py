@@ -67,10 +67,12 @@ def test_what_is_there_stays_until_the_end(tmp_path):
         writer.add(episode())
     with pytest.raises(FileExistsError, match="overwrite=True"):
         TransitionWriter(tmp_path / "a")
-    with pytest.raises(RuntimeError, match="stop"):
-        with TransitionWriter(tmp_path / "a", overwrite=True) as writer:
-            writer.add(episode(7))
-            raise RuntimeError("stop")
+    with (
+        pytest.raises(RuntimeError, match="stop"),
+        TransitionWriter(tmp_path / "a", overwrite=True) as writer,
+    ):
+        writer.add(episode(7))
+        raise RuntimeError("stop")
     assert len(load_transitions(tmp_path / "a")) == 3
     with TransitionWriter(tmp_path / "a", overwrite=True) as writer:
         writer.add(episode(7))
@@ -135,29 +137,37 @@ def test_a_bad_episode_is_refused_and_can_be_skipped(rows, ends, match, tmp_path
 
 def test_texts_and_reserved_names_are_refused(tmp_path):
     for key, value in (("text", "cup"), ("shape", torch.zeros(3))):
-        with pytest.raises(ValueError, match=f"'{key}' of episode 0"):
-            with TransitionWriter(tmp_path / "a") as writer:
-                writer.add(episode().set(key, value))
+        with (
+            pytest.raises(ValueError, match=f"'{key}' of episode 0"),
+            TransitionWriter(tmp_path / "a") as writer,
+        ):
+            writer.add(episode().set(key, value))
     assert not list(tmp_path.iterdir())
 
 
 def test_what_has_no_end_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="no episode was added"):
-        with TransitionWriter(tmp_path / "a"):
-            pass
-    with pytest.raises(ValueError, match=r"episode 1 .* has no end"):
-        with TransitionWriter(tmp_path / "a") as writer:
-            writer.add(episode())
-            writer.add(episode(ends=False), ends=False)
+    with (
+        pytest.raises(ValueError, match="no episode was added"),
+        TransitionWriter(tmp_path / "a"),
+    ):
+        pass
+    with (
+        pytest.raises(ValueError, match=r"episode 1 .* has no end"),
+        TransitionWriter(tmp_path / "a") as writer,
+    ):
+        writer.add(episode())
+        writer.add(episode(ends=False), ends=False)
     assert not list(tmp_path.iterdir())
 
 
 def test_bounds_are_checked_early(tmp_path):
     with pytest.raises(ValueError, match="finite"):
         TransitionWriter(tmp_path / "a", action_bounds=([0.0], [np.inf]))
-    with pytest.raises(ValueError, match=r"action_bounds have shape \[1\]"):
-        with TransitionWriter(tmp_path / "a", action_bounds=([0.0], [1.0])) as writer:
-            writer.add(episode())
+    with (
+        pytest.raises(ValueError, match=r"action_bounds have shape \[1\]"),
+        TransitionWriter(tmp_path / "a", action_bounds=([0.0], [1.0])) as writer,
+    ):
+        writer.add(episode())
     assert not list(tmp_path.iterdir())
 
 
@@ -174,21 +184,25 @@ def test_only_in_its_block(tmp_path):
 @pytest.mark.parametrize("rows", [None, 1_000_000])
 def test_a_full_disk_is_an_error_and_leaves_nothing(rows, small_disk):
     large = episode(100_000)
-    with pytest.raises(OSError, match=r"the disk is full: .*\.memmap needs \d+ bytes"):
-        with TransitionWriter(small_disk / "a", rows=rows) as writer:
-            for _ in range(3):
-                writer.add(large)
+    with (
+        pytest.raises(OSError, match=r"the disk is full: .*\.memmap needs \d+ bytes"),
+        TransitionWriter(small_disk / "a", rows=rows) as writer,
+    ):
+        for _ in range(3):
+            writer.add(large)
     assert not list(small_disk.iterdir())
 
 
 def test_after_a_failed_write_nothing_is_kept(small_disk):
-    with pytest.raises(ValueError, match=r"episode 1 .* could not be written"):
-        with TransitionWriter(small_disk / "a") as writer:
+    with (
+        pytest.raises(ValueError, match=r"episode 1 .* could not be written"),
+        TransitionWriter(small_disk / "a") as writer,
+    ):
+        writer.add(episode())
+        with pytest.raises(OSError, match="disk is full"):
+            writer.add(episode(400_000))
+        with pytest.raises(RuntimeError, match="failed earlier"):
             writer.add(episode())
-            with pytest.raises(OSError, match="disk is full"):
-                writer.add(episode(400_000))
-            with pytest.raises(RuntimeError, match="failed earlier"):
-                writer.add(episode())
     assert not list(small_disk.iterdir())
 
 

@@ -125,7 +125,7 @@ def episode_transitions(
     td["next"] = after
     if rewards is not None:
         # In float32 even if they are integers: they are added to values.
-        reward = reader.column("reward", rewards, length).astype(np.float32)
+        reward = reader.column("reward", rewards, length).astype(float)
         td["next", "reward"] = reader.tensors({"reward": reward})["reward"]
     for name, flags in (("terminated", terminated), ("truncated", truncated)):
         td["next", name] = reader.flags(name, flags, length)

@@ -327,12 +327,6 @@ def _index(
     done_key: NestedKey | None,
     number: int,
 ) -> TrajectoryIndex:
-    get_leaf(
-        source,
-        trajectory_key,
-        f"source {number} lacks the trajectory ids",
-        "pass trajectory_key=",
-    )
     try:
         return trajectory_index(
             source, trajectory_key=trajectory_key, done_key=done_key
@@ -359,6 +353,12 @@ def _check_sources(
                 f"source {number} has batch size {list(source.batch_size)}, expected "
                 "[T] with at least one row"
             )
+        get_leaf(
+            source,
+            id_keys[number],
+            f"source {number} lacks the trajectory ids",
+            "pass trajectory_key=, a list if the sources have different keys",
+        )
     left_out = [key_path(as_key(key)) for key in exclude]
     for key in left_out:
         if all(source.get(key, None) is None for source in sources):
