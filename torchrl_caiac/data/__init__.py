@@ -16,6 +16,7 @@ from torchrl_caiac.data.load_robomimic import load_robomimic
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
+from torchrl_caiac.data.to_minari import to_minari
 from torchrl_caiac.data.transition_writer import TransitionWriter
 from torchrl_caiac.data.write_transitions import write_transitions
 
@@ -37,6 +38,7 @@ __all__ = [
     "mix_trajectories",
     "offline_buffer",
     "record_episode",
+    "to_minari",
     "verify_digests",
     "write_digests",
     "write_transitions",
