@@ -39,6 +39,8 @@ LAYERS = [
     {"modules"},
     {"check"},
     {"objectives"},
+    {"_fit_rows"},
+    {"_fit_quality"},
     {"fit"},
     {"influence"},
     {"transforms"},
