@@ -63,9 +63,9 @@ class OGBenchTruth:
         """Returns which entities an action might move: a safe and fast bound.
 
         An entity is in reach if the gap between it and the robot, or another entity in
-        reach, is smaller than 8 cm and the way of the fastest entity in a step. In 800 states of
-        cube-double, scene and puzzle-3x3, no action bridged a gap wider than 5 cm. Actions
-        that are repeated for several steps were not measured.
+        reach, is smaller than 8 cm and the way of the fastest entity in a step. In 800
+        states of cube-double, scene and puzzle-3x3, no action bridged a gap wider than
+        5 cm. Actions that are repeated for several steps were not measured.
 
         Args:
             state (array_like): ``[S]``, see :class:`OGBenchSimulator`.
