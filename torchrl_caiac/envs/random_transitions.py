@@ -228,7 +228,7 @@ def random_episodes(
         :func:`~torchrl_caiac.data.collect.record_episode` returns it.
 
     Raises:
-        ValueError: the bounds of the actions are not finite.
+        ValueError: the action space is not a box, or its bounds are not finite.
 
     Examples:
         >>> import numpy as np
@@ -242,6 +242,10 @@ def random_episodes(
         (3, 4)
     """
     space = env.action_space
+    if not (hasattr(space, "low") and hasattr(space, "high")):
+        raise ValueError(
+            f"the action space is {space}, expected a box: uniform actions need bounds"
+        )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise ValueError(
             f"the bounds of the actions are {space.low} and {space.high}, expected "
