@@ -192,9 +192,7 @@ def random_transitions(
             description=f"random actions, {states_per_file} states at a time",
         )
         parts = [load_episode(file)[0] for file in report.files]
-    rows: TensorDict = torch.cat(  # type: ignore[assignment]
-        [_transitions(part[_ROOT], key) for part in parts]  # type: ignore[arg-type]
-    )
+    rows: TensorDict = torch.cat([_transitions(part[_ROOT], key) for part in parts])
     lengths = torch.from_numpy(np.concatenate([part["lengths"] for part in parts]))
     rows["episode"] = torch.arange(len(lengths)).repeat_interleave(lengths)
     if path is None:

@@ -1,11 +1,21 @@
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
+import torch
 from ogbench.utils import load_dataset
 
 from tests.envs.ogbench.names import NAMES, STEPS
-from torchrl_caiac.envs.ogbench import create_ogbench_play, make_ogbench_env
+from torchrl_caiac.data import load_ogbench, mix_trajectories
+from torchrl_caiac.envs import random_transitions
+from torchrl_caiac.envs.ogbench import (
+    OGBenchSimulator,
+    create_ogbench_play,
+    make_ogbench_env,
+    ogbench_states,
+)
 
 TYPES = {
     "observations": np.float32,
@@ -146,3 +156,20 @@ def test_environments_collect_and_do_not_end_at_a_goal():
     ends = [env.step(np.zeros(5))[2:4] for _ in range(7)]
     assert ends == [(False, False)] * 6 + [(False, True)]
     env.close()
+
+
+def test_random_rows_mix_with_the_loaded_data(files, tmp_path):
+    data = load_ogbench(files["scene"], tmp_path / "data", progress=False)
+    states = ogbench_states(data)
+    random = random_transitions(
+        functools.partial(OGBenchSimulator, "scene"),
+        states[::30],
+        2,
+        observations=data["observation"][::30],
+        num_workers=1,
+        progress=False,
+    )
+    mixed = mix_trajectories([data, random])
+    assert len(mixed) == len(data) + len(random)
+    assert torch.equal(random["observation"][::2], data["observation"][::30])
+    assert torch.equal(ogbench_states(random)[::2], states[::30])

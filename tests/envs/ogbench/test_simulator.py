@@ -109,7 +109,7 @@ def test_positions_are_where_the_observation_says(simulators):
         ("button1", 120, 2),
     ):
         value = observation[columns[name][column]]
-        assert np.allclose(value, places[name] * scale, atol=1e-5)
+        assert np.allclose(value, places[name][0] * scale, atol=1e-5)
 
 
 @pytest.mark.parametrize(
