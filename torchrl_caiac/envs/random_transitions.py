@@ -103,9 +103,9 @@ def random_transitions(
     Args:
         env (callable): makes the environment, in each process: a class or a
             ``functools.partial`` of one, such as
-            :class:`~torchrl_caiac.envs.ogbench.OGBenchSimulator`,
-            :class:`~torchrl_caiac.envs.kitchen.RestorableKitchen` or
-            :class:`~torchrl_caiac.envs.fetch_push.RestorableFetchPush`. For others a
+            :class:`~torchrl_caiac.envs.OGBenchSimulator`,
+            :class:`~torchrl_caiac.envs.RestorableKitchen` or
+            :class:`~torchrl_caiac.envs.RestorableFetchPush`. For others a
             class of a few lines is enough, see :class:`RestorableEnv`.
         states (array_like): the states ``[M, S]``.
         actions_per_state (int): the number of times that each state is restored, for
@@ -146,8 +146,7 @@ def random_transitions(
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_caiac.envs import random_transitions
-        >>> from torchrl_caiac.envs.ogbench import OGBenchSimulator
+        >>> from torchrl_caiac.envs import OGBenchSimulator, random_transitions
         >>> simulator = OGBenchSimulator("cube-double")
         >>> states = np.stack([simulator.reset(seed=i) for i in range(3)])
         >>> rows = random_transitions(
