@@ -15,6 +15,10 @@ from torchrl_caiac.influence.mixture_divergence import causal_action_influence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
+from torchrl_caiac.influence.thresholds import (
+    ThresholdSuggestions,
+    suggest_thresholds,
+)
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,
     TrueInfluence,
@@ -29,6 +33,7 @@ __all__ = [
     "EntityReport",
     "ScoreOnWrite",
     "SimulatorInfluence",
+    "ThresholdSuggestions",
     "TrueInfluence",
     "best_threshold",
     "causal_action_influence",
@@ -37,5 +42,6 @@ __all__ = [
     "roc_auc",
     "score_buffer",
     "score_file",
+    "suggest_thresholds",
     "true_influence",
 ]
