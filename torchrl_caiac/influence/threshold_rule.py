@@ -9,7 +9,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["MOVES", "RESTS", "Confidence", "Split", "split_scores"]
+__all__ = ["DEFAULT_THRESHOLD", "MOVES", "RESTS", "Confidence", "Split", "split_scores"]
 
 Confidence = Literal[
     "two clear modes",
@@ -17,6 +17,8 @@ Confidence = Literal[
     "one mode: always influenced",
     "unclear",
 ]
+#: The threshold of :class:`~torchrl_caiac.CAIACTransform`, in nats for CAI.
+DEFAULT_THRESHOLD = 0.05
 #: The motion of a row's entity; any other number: neither clearly.
 MOVES, RESTS = 1, 0
 
