@@ -49,7 +49,7 @@ def test_says_once_what_is_never_or_always_free() -> None:
 
 def test_says_nothing_where_an_entity_is_free_now_and_then() -> None:
     rb = buffer(0.3, 0.01)
-    data = rb.storage[:]
+    data = rb.storage[:].clone()
     data["s"] = torch.rand(500, 3) / 10
     rb.empty()
     rb.extend(data)
