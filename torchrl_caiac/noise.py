@@ -9,10 +9,11 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
+from torchrl_caiac._layout_units import position_features
 from torchrl_caiac._torchrl import storage_rows
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["EntityNoise", "resting_noise"]
+__all__ = ["EntityNoise", "resting_noise", "sample_rows"]
 
 _SHARE = 0.1  # of the median change while it moves: smaller changes do not matter
 _DEVIATIONS = 4.0  # of the noise: larger changes are motion
@@ -66,7 +67,8 @@ def resting_noise(
 
     The floor of a column is the largest of three numbers: the noise at rest, a tenth of
     the median change while the entity moves, and the resolution of the numbers.
-    The tolerance is the same with four times the noise.
+    The tolerance is the same with four times the noise, and at least the 99.9 %
+    quantile of the changes at rest.
 
     Args:
         data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
@@ -103,7 +105,7 @@ def resting_noise(
         >>> round(cup.floor[0], 4), round(cup.noise[0], 4)
         (0.05, 0.001)
     """
-    rows = _sample(data, max_rows)
+    rows = sample_rows(data, max_rows)
     layout.check(rows, next=True)
     now = layout.read(rows).double().flatten(0, -2)
     after = layout.read(rows, next=True).double().flatten(0, -2)
@@ -124,12 +126,31 @@ def resting_noise(
     )
     result = {}
     for name, where in layout.slices(rows).items():
-        columns = _position_features(layout, name, where.stop - where.start)
+        columns = position_features(layout, name, where.stop - where.start)
         result[name] = _entity(change[:, where], rounding[where], columns)
     return result
 
 
-def _sample(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBase:
+def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBase:
+    """Returns evenly spaced rows of a dataset.
+
+    Args:
+        data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
+        max_rows (int): the largest number of rows.
+
+    Returns:
+        TensorDictBase: ``[n]``; all rows, not copied, if there are not more.
+
+    Raises:
+        ValueError: there are no rows, or ``max_rows`` is less than 1.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.noise import sample_rows
+        >>> sample_rows(TensorDict({"x": torch.arange(9)}, [9]), 3)["x"]
+        tensor([0, 4, 8])
+    """
     if isinstance(max_rows, bool) or not isinstance(max_rows, int) or max_rows < 1:
         raise ValueError(f"max_rows must be an int of at least 1, got {max_rows!r}")
     if isinstance(data, ReplayBuffer):
@@ -147,16 +168,6 @@ def _sample(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBas
     return data[torch.linspace(0, len(data) - 1, max_rows).round().long()]
 
 
-def _position_features(layout: EntityLayout, name: str, width: int) -> list[int]:
-    """Returns the features of an entity that tell whether it moves."""
-    if name not in layout.positions:
-        return list(range(width))
-    if layout.is_flat:
-        own = layout.columns[name]
-        return [own.index(column) for column in layout.positions[name]]
-    return list(layout.positions[name])
-
-
 def _entity(
     change: torch.Tensor, rounding: torch.Tensor, columns: list[int]
 ) -> EntityNoise:
@@ -169,8 +180,9 @@ def _entity(
     varies = large > resolution
     tell = [c for c in columns if bool(varies[c])]
     nan = torch.full((width,), math.nan, dtype=change.dtype)
+    rests = torch.ones(count, dtype=torch.bool)
     if not tell:
-        noise, moving, rests = change.square().mean(0).sqrt(), nan, torch.ones(count)
+        noise, moving = change.square().mean(0).sqrt(), nan
         reason = f"never moves in {count} rows"
     else:
         size = (change[:, tell] / large[tell]).amax(1)
@@ -188,11 +200,15 @@ def _entity(
     quiet = torch.where(noise.isnan(), zero, noise)
     least = torch.maximum(part, resolution)
     floor = torch.maximum(quiet, least)
+    tolerance = torch.maximum(_DEVIATIONS * quiet, least)
+    if bool(rests.any()):
+        at_rest = torch.stack([_quantile(c, _LARGE) for c in change[rests].T])
+        tolerance = torch.maximum(tolerance, at_rest)
     if not reason:
         reason = _reason(rests, noise, moving, floor, resolution, tell)
     return EntityNoise(
         floor=tuple(floor.tolist()),
-        tolerance=tuple(torch.maximum(_DEVIATIONS * quiet, least).tolist()),
+        tolerance=tuple(tolerance.tolist()),
         noise=tuple(noise.tolist()),
         moving=tuple(moving.tolist()),
         rest_share=float(rests.double().mean()),
