@@ -18,6 +18,10 @@ from torchrl_caiac.influence.residual import ResidualInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
+from torchrl_caiac.influence.thresholds import (
+    ThresholdSuggestions,
+    suggest_thresholds,
+)
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,
     TrueInfluence,
@@ -35,6 +39,7 @@ __all__ = [
     "ResidualInfluence",
     "ScoreOnWrite",
     "SimulatorInfluence",
+    "ThresholdSuggestions",
     "TrueInfluence",
     "action_coverage",
     "best_threshold",
@@ -44,5 +49,6 @@ __all__ = [
     "roc_auc",
     "score_buffer",
     "score_file",
+    "suggest_thresholds",
     "true_influence",
 ]
