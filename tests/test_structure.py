@@ -41,6 +41,7 @@ LAYERS = [
     {"transforms"},
     {"evaluation"},
     {"_figures", "plotting"},
+    {"scored"},
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))
