@@ -64,7 +64,7 @@ def entity_places(layout: EntityLayout, data: TensorDictBase) -> dict[str, Place
         False
     """
     places = {}
-    for name, features in layout.slices(data).items():
+    for name, features in layout.slices(data[:1]).items():
         if layout.is_flat:
             own = list(layout.columns[name])
             key = "/".join(path(layout.in_keys[0]))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
 from torchrl_caiac.trajectories import TrajectoryIndex
 
-__all__ = ["EntityShares", "choose_trajectories", "entity_shares", "influenced_mask"]
+__all__ = ["EntityShares", "choose_trajectories", "entity_shares"]
 
 
 @dataclass(frozen=True)
@@ -26,33 +26,6 @@ class EntityShares:
 
     rows: float
     windows: dict[int, float]
-
-
-def influenced_mask(
-    scores: torch.Tensor, names: Sequence[str], thresholds: Mapping[str, float]
-) -> torch.Tensor:
-    """Returns where each entity's score is above its threshold.
-
-    Args:
-        scores (torch.Tensor): ``[T, N]``.
-        names (sequence of str): the ``N`` entities.
-        thresholds (mapping of str to float): the threshold of each entity; one without
-            a threshold counts as always influenced, as a robot does.
-
-    Returns:
-        torch.Tensor: bool ``[T, N]``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.report.shares import influenced_mask
-        >>> scores = torch.tensor([[3.0, 0.1], [3.0, 0.4]])
-        >>> influenced_mask(scores, ["arm", "cup"], {"cup": 0.3})
-        tensor([[ True, False],
-                [ True,  True]])
-    """
-    limits = torch.tensor([thresholds.get(name, -torch.inf) for name in names])
-    # As CAIACTransform compares them: in the dtype of the scores.
-    return scores > limits.to(scores)
 
 
 def entity_shares(

@@ -95,9 +95,10 @@ def sample_swaps(
     """
     keys = [*layout.in_keys, *map(layout.next, layout.in_keys), score_key]
     generator = torch.Generator().manual_seed(seed)
+    limits = set(thresholds.values())
     transform = CAIACTransform(
         layout,
-        thresholds,
+        limits.pop() if len(limits) == 1 else thresholds,
         ratio,
         score_key=score_key,
         generator=generator,
