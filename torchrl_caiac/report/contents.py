@@ -37,6 +37,7 @@ from torchrl_caiac.scored import ScoredDataset
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 
 __all__ = [
+    "NEVER_INFLUENCED",
     "Entity",
     "Panel",
     "Problem",
@@ -46,6 +47,8 @@ __all__ = [
 ]
 
 _logger = logging.getLogger("torchrl_caiac.report")
+#: What ``suggest_thresholds`` says of an entity that nothing influences.
+NEVER_INFLUENCED = "one mode: never influenced"
 _CHECKED_ROWS = 50_000
 _MOST_STRIPS = 12  # entities along one trajectory
 _MOST_SCORES = 200_000  # scores in one histogram
@@ -140,7 +143,7 @@ class ReportContents:
         length_panel (Panel, optional): the distribution of lengths; ``None`` if all
             are the same.
         influence_panels (list of Panel): one for each trajectory shown.
-        hidden_entities (int): entities that the influence panels leave out.
+        hidden_entities (list of str): what the influence panels leave out.
         score_panels (list of Panel): one for each entity that is not fixed.
         pairs (list of PairCoverage): those that gain most first.
         pair_panels (list of Panel): the first of these.
@@ -158,7 +161,7 @@ class ReportContents:
     check: DatasetReport
     length_panel: Panel | None
     influence_panels: list[Panel]
-    hidden_entities: int
+    hidden_entities: list[str]
     score_panels: list[Panel]
     pairs: list[PairCoverage]
     pair_panels: list[Panel]
@@ -221,7 +224,7 @@ def collect_contents(
             name=name,
             fixed=name in layout.fixed,
             features=_features(layout, name),
-            places=", ".join(places[name].labels) if places[name].known else "",
+            places=places[name].text if places[name].known else "",
             floor=_floor(layout, name),
             threshold=None if name in layout.fixed else scored.thresholds[name],
             confidence=scored.confidence.get(name, ""),
@@ -249,7 +252,7 @@ def collect_contents(
     )
     pairs = pair_coverage(swaps, places, layout.fixed)
     chosen = choose_examples(
-        swaps, influenced, places, layout.fixed, settings.examples
+        swaps, influenced, places, layout.fixed, index, settings.examples
     )
     examples, rendered, trouble = draw_examples(
         scored, swaps, chosen, influenced, places, index, render
@@ -363,42 +366,49 @@ def _findings(check: DatasetReport) -> list[Problem]:
 
 
 def _threshold_problems(entities: Sequence[Entity]) -> list[Problem]:
-    found = []
-    for entity in entities:
-        if entity.fixed:
-            continue
-        if entity.confidence == "unclear":
-            found.append(
-                Problem(
-                    "warning",
-                    f"The threshold of {entity.name} is unclear: {entity.reason}",
-                    "it may be swapped while the agent moves it, or never",
-                    "look at its scores below, and choose a threshold by hand",
-                )
+    swappable = [entity for entity in entities if not entity.fixed]
+    found = [
+        Problem(
+            "warning",
+            f"The threshold of {entity.name} is unclear: {entity.reason}",
+            "it may be swapped while the agent moves it, or never",
+            "look at its scores below, and choose a threshold by hand",
+        )
+        for entity in swappable
+        if entity.confidence == "unclear"
+    ]
+    never = [e.name for e in swappable if e.shares.rows == 0]
+    if never:
+        found.append(
+            Problem(
+                "warning",
+                f"Never swapped would be {', '.join(never)}: the score is above the "
+                "threshold in every transition",
+                "no counterfactual changes them",
+                "check that they ever rest; if so, the threshold is too low",
             )
-        if entity.shares.rows == 0:
-            found.append(
-                Problem(
-                    "warning",
-                    f"{entity.name} would never be swapped: its score is above the "
-                    "threshold in every transition",
-                    "no counterfactual changes it",
-                    "check that it ever rests; if so, the threshold is too low",
-                )
+        )
+    always = [e for e in swappable if e.shares.rows == 1]
+    expected = [e.name for e in always if e.confidence == NEVER_INFLUENCED]
+    if expected:
+        found.append(
+            Problem(
+                "note",
+                f"Never influenced are {', '.join(expected)}: they may be swapped in "
+                "every transition",
             )
-        if entity.shares.rows == 1:
-            expected = entity.confidence == "one mode: never influenced"
-            found.append(
-                Problem(
-                    "note" if expected else "warning",
-                    f"{entity.name} may be swapped in every transition: its score is "
-                    "never above the threshold",
-                    ""
-                    if expected
-                    else "if the agent does move it, counterfactuals are wrong",
-                    "" if expected else "look at its scores below",
-                )
+        )
+    others = [e.name for e in always if e.confidence != NEVER_INFLUENCED]
+    if others:
+        found.append(
+            Problem(
+                "warning",
+                f"Swapped in every transition may be {', '.join(others)}: the score is "
+                "never above the threshold",
+                "if the agent does move them, counterfactuals are wrong",
+                "look at their scores below",
             )
+        )
     return found
 
 
@@ -424,14 +434,15 @@ def _influence_panels(
     influenced: torch.Tensor,
     index: TrajectoryIndex,
     settings: ReportSettings,
-) -> tuple[list[Panel], int]:
+) -> tuple[list[Panel], list[str]]:
     layout = scored.layout
-    shown = [i for i, name in enumerate(layout.names) if name not in layout.fixed]
-    hidden = max(0, len(shown) - _MOST_STRIPS)
-    if hidden:
-        # Those that are influenced most often, in layout order.
-        often = influenced[:, shown].sum(0).argsort(descending=True, stable=True)
-        shown = sorted(shown[i] for i in often[:_MOST_STRIPS].tolist())
+    movable = [i for i, name in enumerate(layout.names) if name not in layout.fixed]
+    # Those that are influenced most often, in layout order.
+    often = influenced[:, movable].sum(0)
+    most = min(_MOST_STRIPS, int((often > 0).sum()) or len(movable))
+    order = often.argsort(descending=True, stable=True)[:most]
+    shown = sorted(movable[i] for i in order.tolist())
+    hidden = [layout.names[i] for i in movable if i not in shown]
     names = [layout.names[i] for i in shown]
     panels = []
     for number in choose_trajectories(

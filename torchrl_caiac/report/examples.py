@@ -15,7 +15,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.report.figures import Marks, draw_marks, draw_plan
 from torchrl_caiac.report.pictures import RenderFn, as_pictures, known_renderer
 from torchrl_caiac.report.places import Place
-from torchrl_caiac.report.swaps import SampledSwaps
+from torchrl_caiac.report.swaps import SampledSwaps, moved_entities
 from torchrl_caiac.scored import ScoredDataset
 from torchrl_caiac.trajectories import TrajectoryIndex
 
@@ -32,7 +32,9 @@ class Example:
         row (int): the stored transition.
         trajectory (int): the number of its trajectory, from 1.
         step (int): its step in the trajectory, from 0.
-        swapped (tuple of str): the entities that were swapped.
+        moved (tuple of str): the entities that a swap has put elsewhere.
+        unmoved (tuple of str): the entities that were swapped, but whose place is about
+            the same.
         influenced (tuple of str): the entities that the action influences, without
             fixed ones.
         svg (str): a plot; ``""`` if there are pictures.
@@ -43,7 +45,8 @@ class Example:
     row: int
     trajectory: int
     step: int
-    swapped: tuple[str, ...]
+    moved: tuple[str, ...]
+    unmoved: tuple[str, ...]
     influenced: tuple[str, ...]
     svg: str
     pictures: tuple[str, ...]
@@ -80,20 +83,23 @@ def draw_examples(
     if chosen:
         frames, trouble = _frames(scored, swaps, chosen, render)
     numbers = index.numbers()
+    moved, _ = moved_entities(swaps, places)
+    names = np.array(layout.names, dtype=object)
     examples = []
     for n, sample in enumerate(chosen):
         row = int(swaps.rows[sample])
         trajectory = int(numbers[row])
         first = index.ends[trajectory] - index.lengths[trajectory] + 1
-        names = np.array(layout.names, dtype=object)
-        swapped = tuple(names[swaps.swapped[sample].numpy()])
+        elsewhere, swapped = moved[sample], swaps.swapped[sample]
+        moved_names = tuple(names[(swapped & elsewhere).numpy()])
         kept = tuple(
             name
             for name in names[influenced[row].numpy()]
             if name not in layout.fixed
         )
         description = (
-            f"A recorded state and its counterfactual. Swapped: {', '.join(swapped)}."
+            "A recorded state and its counterfactual. Swapped: "
+            f"{', '.join(moved_names)}."
         )
         if frames is None:
             svg = _plot(swaps, sample, places, layout, f"example{n}", description)
@@ -106,7 +112,8 @@ def draw_examples(
                 row=row,
                 trajectory=trajectory + 1,
                 step=int(index.position(torch.tensor(row)) - first),
-                swapped=swapped,
+                moved=moved_names,
+                unmoved=tuple(names[(swapped & ~elsewhere).numpy()]),
                 influenced=kept,
                 svg=svg,
                 pictures=pictures,

@@ -35,7 +35,8 @@ __all__ = [
     "draw_scores",
 ]
 
-_WIDTH = 4.6  # inches; a page on a phone is about as wide
+# Inches. On a phone, a figure is about 340 pixels wide.
+_WIDTH, _NARROW = 4.6, 4.0
 _MOST_POINTS = 500  # of a curve
 Marks = Mapping[str, "tuple[NDArray[Any], NDArray[Any], bool]"]
 
@@ -126,7 +127,7 @@ def draw_scores(
         edges += np.log10(threshold) - edges[np.abs(edges - np.log10(threshold)).argmin()]
         edges = np.concatenate([[edges[0] - width], edges, [edges[-1] + width]])
     with drawing():
-        figure = new_figure(_WIDTH, 2.1)
+        figure = new_figure(_NARROW, 2.0)
         axes = figure.add_subplot()
         if len(positive):
             counts, _ = np.histogram(np.log10(positive), edges)
@@ -192,7 +193,7 @@ def draw_coverage(pair: PairCoverage, *, name: str, description: str) -> str:
     before, after = pair.before.numpy(), pair.after.numpy()
     x, y = (edges.numpy() for edges in pair.edges)
     with drawing():
-        figure = new_figure(_WIDTH, 3.4)
+        figure = new_figure(_NARROW, 3.1)
         axes = figure.add_subplot()
         # The first entity is on the horizontal axis: a row of cells is a column here.
         for cells, colour in ((before, RECORDED), (after & ~before, ADDED)):
@@ -225,7 +226,7 @@ def draw_lengths(lengths: NDArray[Any], *, name: str, description: str) -> str:
     step = max(1, -(-(high - low + 1) // 24))
     edges = np.arange(low, high + step + 1, step) - 0.5
     with drawing():
-        figure = new_figure(_WIDTH, 1.7)
+        figure = new_figure(_NARROW, 1.6)
         axes = figure.add_subplot()
         axes.hist(lengths, edges, color=RECORDED, rwidth=0.9)
         axes.set_xlabel("length of a trajectory, transitions")

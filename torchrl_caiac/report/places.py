@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tensordict import TensorDictBase
 
+from torchrl_caiac._columns import column_ranges
 from torchrl_caiac._keys import path
 from torchrl_caiac.entities import EntityLayout
 
@@ -21,13 +23,17 @@ class Place:
             :meth:`~torchrl_caiac.EntityLayout.read`.
         labels (tuple of str): the names of these features, such as
             ``"observation[10]"``.
+        floors (tuple of float): the change of each feature that is noise; 0 if unknown.
         known (bool): whether the layout says that these are positions. If not, they are
             all features of the entity, velocities included.
+        text (str): all labels in short, such as ``"observation[10:13]"``.
     """
 
     features: tuple[int, ...]
     labels: tuple[str, ...]
-    known: bool
+    floors: tuple[float, ...]
+    known: bool = True
+    text: str = ""
 
     @property
     def is_point(self) -> bool:
@@ -58,28 +64,31 @@ def entity_places(layout: EntityLayout, data: TensorDictBase) -> dict[str, Place
         ... )
         >>> data = TensorDict({"observation": torch.zeros(5, 6)}, [5])
         >>> places = entity_places(layout, data)
-        >>> places["cup"].features, places["cup"].labels
-        ((4, 5), ('observation[2]', 'observation[3]'))
+        >>> places["cup"].features, places["cup"].labels, places["cup"].text
+        ((4, 5), ('observation[2]', 'observation[3]'), 'observation[2:4]')
         >>> places["arm"].known
         False
     """
     places = {}
     for name, features in layout.slices(data[:1]).items():
         if layout.is_flat:
-            own = list(layout.columns[name])
             key = "/".join(path(layout.in_keys[0]))
+            numbers: Sequence[int] = layout.columns[name]
             columns = layout.positions.get(name) or layout.achieved.get(name) or ()
-            chosen = [own.index(column) for column in columns]
-            numbers = own
         else:
             key = "/".join(path(layout.keys[name]))
-            chosen = list(layout.positions.get(name, ()))
-            numbers = list(range(features.stop - features.start))
+            numbers = range(features.stop - features.start)
+            columns = layout.positions.get(name, ())
+        chosen = [numbers.index(column) for column in columns]
         known = bool(chosen)
         chosen = chosen or list(range(len(numbers)))
+        floor = layout.variance_floor.get(name, 0.0)
+        floors = floor if isinstance(floor, tuple) else (floor,) * len(numbers)
         places[name] = Place(
             tuple(features.start + i for i in chosen),
             tuple(f"{key}[{numbers[i]}]" for i in chosen),
+            tuple(float(floors[i]) for i in chosen),
             known,
+            key + column_ranges([numbers[i] for i in chosen]),
         )
     return places

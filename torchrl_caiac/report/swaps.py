@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl_caiac.data.offline_buffer import offline_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.report.places import Place
+from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.transforms import CAIACTransform
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "PairCoverage",
     "SampledSwaps",
     "choose_examples",
+    "moved_entities",
     "pair_coverage",
     "sample_swaps",
 ]
@@ -27,6 +29,7 @@ __all__ = [
 #: The number of intervals into which the range of a position is divided.
 CELLS = 20
 _BATCH = 512
+_NOISE = 2  # times the floor of the layout, what may still be noise
 _OUTLIERS = 0.005  # the share of positions below and above the range
 
 
@@ -168,7 +171,8 @@ def pair_coverage(
     """Compares the combinations of places in recorded and in sampled states.
 
     One feature stands for the place of an entity: the position that varies most.
-    Entities that never move are left out, and pairs of fixed entities.
+    Left out are pairs of fixed entities, and entities that never move: whose positions
+    all stay within four times the noise of the layout's ``variance_floor``.
 
     Args:
         swaps (SampledSwaps): the samples.
@@ -187,7 +191,7 @@ def pair_coverage(
         >>> swaps = SampledSwaps(
         ...     torch.arange(2), recorded, torch.tensor([[0.0, 1.0], [1.0, 1.0]]),
         ...     flags[:, 1], flags, 0)
-        >>> places = {"arm": Place((0,), ("x",), True), "cup": Place((1,), ("y",), True)}
+        >>> places = {"arm": Place((0,), ("x",), (0.0,)), "cup": Place((1,), ("y",), (0.0,))}
         >>> pair = pair_coverage(swaps, places, frozenset(["arm"]))[0]
         >>> pair.share_before, pair.share_after
         (0.5, 0.5)
@@ -229,27 +233,61 @@ class _Grid:
 
 def _grid(swaps: SampledSwaps, place: Place) -> _Grid | None:
     """Divides the range of an entity's place; ``None`` if it never changes."""
-    features = list(place.features)
-    recorded = swaps.recorded[:, features].double()
-    limits = torch.tensor([_OUTLIERS, 1 - _OUTLIERS], dtype=torch.float64)
+    recorded = swaps.recorded[:, list(place.features)].double()
     ordered = recorded.sort(0).values
+    limits = torch.tensor([_OUTLIERS, 1 - _OUTLIERS], dtype=torch.float64)
     low, high = ordered[(limits * (len(ordered) - 1)).round().long()]
-    widest = int((high - low).argmax())
-    if not high[widest] > low[widest]:
-        # It moves so rarely that all but outliers are the same.
-        low, high = ordered[0], ordered[-1]
-        widest = int((high - low).argmax())
-        if not high[widest] > low[widest]:
+    least = 2 * _NOISE * torch.tensor(place.floors, dtype=torch.float64)
+    if not (high - low > least).any():
+        low, high = ordered[0], ordered[-1]  # it may move in outliers alone
+        if not (high - low > least).any():
             return None
+    widest = int((high - low).argmax())
     edges = torch.linspace(low[widest], high[widest], CELLS + 1, dtype=torch.float64)
 
     def cells(values: torch.Tensor) -> torch.Tensor:
         # What lies outside of the range counts for the first or last interval.
-        return torch.bucketize(values, edges[1:-1])
+        return torch.bucketize(values.contiguous(), edges[1:-1])
 
-    made = swaps.made[:, features[widest]].double().contiguous()
-    own = recorded[:, widest].contiguous()
-    return _Grid(place.labels[widest], edges, cells(own), cells(made))
+    made = swaps.made[:, place.features[widest]].double()
+    return _Grid(place.labels[widest], edges, cells(recorded[:, widest]), cells(made))
+
+
+def moved_entities(
+    swaps: SampledSwaps, places: Mapping[str, Place]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns which entities a swap has put elsewhere, and how far.
+
+    Args:
+        swaps (SampledSwaps): the samples.
+        places (mapping of str to Place): where each entity is, in layout order.
+
+    Returns:
+        tuple of torch.Tensor: bool ``[M, N]``, whether a position has changed by more
+        than twice its noise and by more than a twentieth of its standard deviation;
+        and float64 ``[M, N]``, the distance in standard deviations.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.report.places import Place
+        >>> from torchrl_caiac.report.swaps import SampledSwaps, moved_entities
+        >>> recorded = torch.tensor([[0.0], [2.0]])
+        >>> flags = torch.tensor([[True], [False]])
+        >>> swaps = SampledSwaps(
+        ...     torch.arange(2), recorded, recorded[[1, 1]], flags[:, 0], flags, 0)
+        >>> moved_entities(swaps, {"cup": Place((0,), ("y",), (0.1,))})[0].tolist()
+        [[True], [False]]
+    """
+    moved, distances = [], []
+    for place in places.values():
+        features = list(place.features)
+        recorded = swaps.recorded[:, features].double()
+        change = (swaps.made[:, features].double() - recorded).abs()
+        spread = recorded.std(0, unbiased=False)
+        least = _NOISE * torch.tensor(place.floors, dtype=torch.float64)
+        moved.append((change > torch.maximum(least, 0.05 * spread)).any(-1))
+        distances.append(change.norm(dim=-1) / spread.norm().clamp_min(1e-300))
+    return torch.stack(moved, -1), torch.stack(distances, -1)
 
 
 def choose_examples(
@@ -257,62 +295,49 @@ def choose_examples(
     influenced: torch.Tensor,
     places: Mapping[str, Place],
     fixed: frozenset[str],
+    index: TrajectoryIndex,
     count: int,
 ) -> list[int]:
     """Chooses counterfactual samples that show what a swap does.
 
-    Samples in which the action influences an entity that can be swapped come first,
-    then those whose swapped entities are moved the most, each entity by its own
-    standard deviation. No stored transition is chosen twice, and at most half of the
-    samples (rounded up) have the same swapped entities.
+    They are in the order in which they were drawn, among samples in which a swap has
+    put an entity elsewhere, by at least half of its standard deviation where there are
+    such. Samples come first in which the action influences an entity that can be
+    swapped. No two have the same trajectory or the same moved and influenced entities,
+    as far as possible.
 
     Args:
         swaps (SampledSwaps): the samples.
         influenced (torch.Tensor): bool ``[T, N]``.
         places (mapping of str to Place): where each entity is, in layout order.
         fixed (frozenset of str): entities that are never swapped.
+        index (TrajectoryIndex): the trajectories of the stored transitions.
         count (int): how many to choose, at most.
 
     Returns:
         list of int: their positions among the samples.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.report.places import Place
-        >>> from torchrl_caiac.report.swaps import SampledSwaps, choose_examples
-        >>> recorded = torch.tensor([[0.0], [1.0], [2.0]])
-        >>> made = torch.tensor([[1.0], [1.0], [0.0]])
-        >>> flags = torch.tensor([[True], [False], [True]])
-        >>> swaps = SampledSwaps(
-        ...     torch.arange(3), recorded, made, flags[:, 0], flags, 0)
-        >>> influenced = torch.zeros(3, 1, dtype=torch.bool)
-        >>> places = {"cup": Place((0,), ("y",), True)}
-        >>> choose_examples(swaps, influenced, places, frozenset(), 1)
-        [2]
     """
     movable = torch.tensor([name not in fixed for name in places])
-    distance = torch.zeros(len(swaps.rows), dtype=torch.float64)
-    for number, place in enumerate(places.values()):
-        features = list(place.features)
-        recorded = swaps.recorded[:, features].double()
-        moved = (swaps.made[:, features].double() - recorded).norm(dim=-1)
-        spread = recorded.std(0, unbiased=False).norm()
-        if spread > 0:
-            # Beyond two deviations more is not better.
-            distance += (moved / spread).clamp_max(2) * swaps.swapped[:, number]
-    busy = (influenced[swaps.rows] & movable).any(-1)
-    rank = (distance + 100 * busy).where(distance > 0, -1.0)
+    moved, distances = moved_entities(swaps, places)
+    busy = influenced[swaps.rows] & movable
+    far = (distances.where(moved, 0.0)).amax(-1) >= 0.5
+    rank = busy.any(-1).long() * 2 + far
+    order = rank.argsort(descending=True, stable=True)
+    order = order[moved.any(-1)[order]]
+    kinds = torch.cat([moved, busy], -1)[order].unique(dim=0, return_inverse=True)[1]
+    trajectories = index.numbers()[swaps.rows[order]]
+    rows = swaps.rows[order]
     chosen: list[int] = []
-    alike: dict[tuple[bool, ...], int] = {}
-    used: set[int] = set()
-    for sample in rank.argsort(descending=True, stable=True).tolist():
-        if len(chosen) == count or rank[sample] < 0:
-            break
-        kind = tuple(swaps.swapped[sample].tolist())
-        row = int(swaps.rows[sample])
-        if row in used or alike.get(kind, 0) >= (count + 1) // 2:
-            continue
-        used.add(row)
-        alike[kind] = alike.get(kind, 0) + 1
-        chosen.append(sample)
-    return chosen
+    # With less and less variety, until there are enough.
+    for differ in ((trajectories, kinds), (trajectories,), (rows,)):
+        used = [set(values[chosen].tolist()) for values in differ]
+        for i in range(len(order)):
+            if len(chosen) == count:
+                break
+            own = [int(values[i]) for values in differ]
+            if i in chosen or any(x in s for x, s in zip(own, used, strict=True)):
+                continue
+            chosen.append(i)
+            for x, seen in zip(own, used, strict=True):
+                seen.add(x)
+    return order[sorted(chosen)].tolist()
