@@ -32,6 +32,7 @@ LAYERS = [
         "trajectories",
     },
     {"checkpoint", "data"},
+    {"noise"},
     {"envs"},
     {"modules"},
     {"check"},
