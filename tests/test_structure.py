@@ -32,7 +32,7 @@ LAYERS = [
         "trajectories",
     },
     {"checkpoint", "data"},
-    {"noise"},
+    {"noise", "layouts"},
     {"envs"},
     {"modules"},
     {"check"},
