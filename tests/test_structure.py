@@ -32,6 +32,7 @@ LAYERS = [
         "trajectories",
     },
     {"checkpoint", "data"},
+    {"noise", "layouts"},
     {"envs"},
     {"modules"},
     {"check"},

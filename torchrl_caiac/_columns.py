@@ -226,6 +226,41 @@ def observation_columns(
     return result
 
 
+def observation_width(
+    width: int | None, columns: Mapping[str, Sequence[int]]
+) -> int | None:
+    """Returns the width of the observation, after checking it.
+
+    Args:
+        width (int, optional): the width, ``None`` for any.
+        columns (mapping of str to sequence of int): the columns of each entity.
+
+    Returns:
+        int, optional: the width.
+
+    Raises:
+        TypeError: the width is not an integer.
+        ValueError: an entity has a column beyond it.
+
+    Examples:
+        >>> from torchrl_caiac._columns import observation_width
+        >>> observation_width(3, {"arm": (0, 2)})
+        3
+    """
+    if width is None:
+        return None
+    if isinstance(width, bool) or not hasattr(width, "__index__"):
+        raise TypeError(f"width must be an int or None, got {width!r}")
+    for name, owned in columns.items():
+        beyond = [column for column in owned if column >= width]
+        if beyond:
+            raise ValueError(
+                f"entity {name!r} has the columns {beyond}, but width is {width}: "
+                "columns count from 0, correct one of the two"
+            )
+    return int(width)
+
+
 def goal_vector_columns(
     goal: Mapping[str, Iterable[int]],
 ) -> dict[str, tuple[int, ...]]:

@@ -61,6 +61,8 @@ def layout_to_dict(layout: EntityLayout) -> dict[str, Any]:
     for part in sorted(_UNITS):
         if getattr(layout, part):
             content[part] = pairs(getattr(layout, part))
+    if layout.width is not None:
+        content["width"] = layout.width
     return content
 
 
@@ -98,10 +100,11 @@ def layout_arguments(content: Any) -> tuple[bool, dict[str, Any]]:
     if not isinstance(is_flat, bool):
         raise _unexpected("flat", "true or false", is_flat)
     expected = _KEYS | set(_FLAT_KEYS if is_flat else ())
-    if content.keys() - _UNITS != expected:
+    optional = _UNITS | ({"width"} if is_flat else set())
+    if content.keys() - optional != expected:
         raise ValueError(
             f"the layout lacks {sorted(expected - content.keys())} and has the unknown "
-            f"{reprlib.repr(sorted(map(str, content.keys() - expected - _UNITS)))}"
+            f"{reprlib.repr(sorted(map(str, content.keys() - expected - optional)))}"
         )
     named = {part: _pairs(content, part) for part in ("entities", "goal", "achieved")}
     for part, pairs in named.items():
@@ -130,6 +133,10 @@ def layout_arguments(content: Any) -> tuple[bool, dict[str, Any]]:
         }
     if "variance_floor" in content:
         arguments["variance_floor"] = _pairs(content, "variance_floor")
+    if "width" in content:
+        if type(content["width"]) is not int:
+            raise _unexpected("width", "a number of columns", content["width"])
+        arguments["width"] = content["width"]
     return is_flat, arguments
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,7 +14,30 @@ from torchrl_caiac._keys import flatten, missing_key
 if TYPE_CHECKING:
     from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["check_data", "check_width", "read_entities", "read_observation"]
+__all__ = [
+    "check_data",
+    "check_width",
+    "name_ready_layouts",
+    "read_entities",
+    "read_observation",
+]
+
+
+# The ready layouts of a width, for error messages. They come later in the imports.
+_ready_layouts: list[Callable[[int], Iterable[str]]] = []
+
+
+def name_ready_layouts(names: Callable[[int], Iterable[str]]) -> None:
+    """Lets error messages name the ready layouts that have the width of the data.
+
+    Args:
+        names (Callable): returns the names of the layouts of a width.
+
+    Examples:
+        >>> from torchrl_caiac._layout_reading import name_ready_layouts
+        >>> name_ready_layouts(lambda width: ())
+    """
+    _ready_layouts.append(names)
 
 
 def read_observation(
@@ -104,13 +128,22 @@ def check_width(layout: EntityLayout, width: int, key: NestedKey | None = None) 
             the layout's own.
 
     Raises:
-        ValueError: the observation is too narrow.
+        ValueError: the observation is too narrow, or has not the layout's own width.
 
     Examples:
         >>> from torchrl_caiac import EntityLayout
         >>> from torchrl_caiac._layout_reading import check_width
         >>> check_width(EntityLayout({"arm": [0, 3]}), 4)
     """
+    if layout.width not in (None, width):
+        others = [name for names in _ready_layouts for name in names(width)]
+        remedy = "take the layout of these data, or correct the data"
+        if others:
+            remedy += f" (ready layouts of this width: {', '.join(others)})"
+        raise ValueError(
+            f"{key or layout.observation_key!r} has {width} columns, but the layout is "
+            f"for {layout.width}: {remedy}"
+        )
     needed = 1 + max(max(columns) for columns in layout.columns.values())
     if width < needed:
         raise ValueError(
@@ -131,7 +164,7 @@ def check_data(layout: EntityLayout, td: TensorDictBase, *, next: bool = False) 
 
     Raises:
         KeyError: a key is missing.
-        TypeError: the observation of a flat layout is not a tensor.
+        TypeError: the observation or the goal of a flat layout is not a tensor.
         ValueError: an observation or a goal has the wrong width.
 
     Examples:
@@ -153,6 +186,11 @@ def check_data(layout: EntityLayout, td: TensorDictBase, *, next: bool = False) 
         keys.append(layout.next(layout.achieved_goal_key))
     for key in keys:
         goal = td.get(key, None)
+        if goal is not None and not isinstance(goal, torch.Tensor):
+            raise TypeError(
+                f"{key!r} is a {type(goal).__name__}, but the goals of a flat layout "
+                "are vectors: leave the entry out of the data, or store one vector"
+            )
         if goal is not None and goal.shape[-1] != layout.goal_width:
             raise ValueError(
                 f"{key!r} has {goal.shape[-1]} columns, but the layout's goal has "

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchrl_caiac._columns import check_names, disjoint_columns
 
-__all__ = ["FloorArgument", "entity_floors", "position_columns"]
+if TYPE_CHECKING:
+    from torchrl_caiac.entities import EntityLayout
+
+__all__ = ["FloorArgument", "entity_floors", "position_columns", "position_features"]
 
 FloorArgument = float | Mapping[str, float | Sequence[float]] | None
 
@@ -64,6 +67,7 @@ def entity_floors(
     floor: FloorArgument,
     names: Sequence[str],
     columns: Mapping[str, tuple[int, ...]],
+    argument: str = "variance_floor",
 ) -> dict[str, float | tuple[float, ...]]:
     """Returns the variance floor of each entity, after checking it.
 
@@ -72,6 +76,8 @@ def entity_floors(
         names (sequence of str): the entities of the layout.
         columns (mapping of str to tuple of int): the columns of each entity, empty
             for nested layouts, whose widths are unknown.
+        argument (str): the argument's name in error messages. Defaults to
+            ``"variance_floor"``.
 
     Returns:
         dict of str to float or tuple of float: one number for an entity, or one for
@@ -91,11 +97,11 @@ def entity_floors(
         return {}
     given: dict[str, Any]
     given = dict(floor) if isinstance(floor, Mapping) else dict.fromkeys(names, floor)
-    check_names(given, names, "variance_floor")
+    check_names(given, names, argument)
     missing = [name for name in names if name not in given]
     if missing:
         raise ValueError(
-            f"variance_floor lacks {missing}: give each entity its own, in the units "
+            f"{argument} lacks {missing}: give each entity its own, in the units "
             "of its columns, or one number for all"
         )
     result: dict[str, float | tuple[float, ...]] = {}
@@ -107,19 +113,54 @@ def entity_floors(
             isinstance(v, (bool, str)) or not hasattr(v, "__float__") for v in values
         ):
             raise TypeError(
-                f"variance_floor of entity {name!r} is {value!r}, expected a number or "
+                f"{argument} of entity {name!r} is {value!r}, expected a number or "
                 "one for each of its columns"
             )
         numbers = tuple(float(v) for v in values)
         if any(not 0 < v < float("inf") for v in numbers):
             raise ValueError(
-                f"variance_floor of entity {name!r} is {value!r}, expected a standard "
-                "deviation in the units of the data, positive and finite"
+                f"{argument} of entity {name!r} is {value!r}, expected "
+                "a number in the units of the data, positive and finite"
             )
         if not one and columns and len(numbers) != len(columns[name]):
             raise ValueError(
-                f"variance_floor of entity {name!r} has {len(numbers)} numbers, "
+                f"{argument} of entity {name!r} has {len(numbers)} numbers, "
                 f"expected one for each of its {len(columns[name])} columns"
             )
         result[name] = numbers[0] if one else numbers
     return result
+
+
+def position_features(layout: EntityLayout, name: str, width: int) -> list[int]:
+    """Returns which features of an entity tell where it is.
+
+    Args:
+        layout (EntityLayout): the entities.
+        name (str): the entity.
+        width (int): the number of its features.
+
+    Returns:
+        list of int: the places of ``layout.positions`` in its features, all of them if
+        the layout does not name the entity's positions.
+
+    Raises:
+        ValueError: a position is beyond the width (nested layouts).
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac._layout_units import position_features
+        >>> layout = EntityLayout({"cup": [4, 5, 6]}, positions={"cup": [5]})
+        >>> position_features(layout, "cup", 3)
+        [1]
+    """
+    if name not in layout.positions:
+        return list(range(width))
+    positions = layout.positions[name]
+    if layout.is_flat:
+        return [layout.columns[name].index(column) for column in positions]
+    if max(positions) >= width:
+        raise ValueError(
+            f"positions give entity {name!r} the features {list(positions)}, but it "
+            f"has {width}: correct positions="
+        )
+    return list(positions)

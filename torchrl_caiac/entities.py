@@ -64,6 +64,9 @@ class EntityLayout(LayoutFiles):
             each entity one number or one for each of its columns. World models and
             the influence by motion use it unless they are given another. Defaults to
             ``None``: unknown.
+        width (int, optional): the number of columns ``D`` of the observation. Data of
+            another width are refused. Defaults to ``None``: any width that holds the
+            columns of the entities.
 
     Raises:
         ValueError: columns overlap, are negative or missing; a name in ``goal``,
@@ -102,6 +105,7 @@ class EntityLayout(LayoutFiles):
         achieved_goal_key: NestedKey = "achieved_goal",
         positions: Mapping[str, Iterable[int]] | None = None,
         variance_floor: FloorArgument = None,
+        width: int | None = None,
     ) -> None:
         self._set_common(entities, fixed, next_key)
         self.observation_key: NestedKey | None = as_key(observation_key)
@@ -109,6 +113,7 @@ class EntityLayout(LayoutFiles):
         self.achieved_goal_key: NestedKey | None = as_key(achieved_goal_key)
         self.keys: dict[str, NestedKey] = {}
         self.columns = _columns.observation_columns(entities)
+        self.width: int | None = _columns.observation_width(width, self.columns)
         _columns.check_goal_names(goal, achieved, self.names, self.fixed, "()")
         self.goal: dict[str, Any] = {}
         self.achieved: dict[str, Any] = {}
@@ -174,7 +179,7 @@ class EntityLayout(LayoutFiles):
         self = cls.__new__(cls)
         self._set_common(entities, fixed, next_key)
         self.observation_key = self.desired_goal_key = self.achieved_goal_key = None
-        self.columns = {}
+        self.columns, self.width = {}, None
         self.keys = _columns.disjoint_keys(entities, "entity")
         _columns.check_goal_names(goal, achieved, self.names, self.fixed, "None")
         self.goal = _columns.disjoint_keys(goal or {}, "goal")

@@ -390,7 +390,7 @@ def _check_tables(tables: Mapping[str, Any], layout: EntityLayout) -> None:
     """Raises if there are not the same entries for all entities that may be swapped."""
     expected = {name for name in layout.names if name not in layout.fixed}
     for name, kinds in _TABLES.items():
-        table = tables[name]
+        table: dict[str, Any] = tables[name]
         for entity, value in table.items():
             if entity not in layout.names:
                 raise ValueError(

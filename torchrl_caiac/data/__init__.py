@@ -6,16 +6,20 @@ from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac.data.action_bounds import action_bounds
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
 from torchrl_caiac.data.digests import verify_digests, write_digests
+from torchrl_caiac.data.episodes import episode_transitions
 from torchrl_caiac.data.load_minari import load_minari
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
+from torchrl_caiac.data.transition_writer import TransitionWriter
 from torchrl_caiac.data.write_transitions import write_transitions
 
 __all__ = [
+    "TransitionWriter",
     "UnreadableFileError",
     "action_bounds",
     "collect_episodes",
+    "episode_transitions",
     "load_episode",
     "load_minari",
     "load_transitions",

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 from torchrl_caiac._torchrl import memmap_folder
 
-__all__ = ["action_bounds", "write_action_bounds"]
+__all__ = ["action_bounds", "check_action_bounds", "write_action_bounds"]
 
 _FILE = "action_space.json"
 
@@ -79,7 +79,7 @@ def action_bounds(
     remedy = "create the data again, or delete this file if the bounds are unknown"
     content = read_json(file, what, remedy)
     try:
-        return _checked(content["low"], content["high"])
+        return check_action_bounds(content["low"], content["high"])
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UnreadableFileError(
             f"{file} is not a readable {what} ({error!r}): {remedy}"
@@ -111,11 +111,29 @@ def write_action_bounds(
         ...     action_bounds(folder)
         (tensor([0.]), tensor([2.]))
     """
-    low, high = _checked(low, high)
+    low, high = check_action_bounds(low, high)
     write_json(Path(folder) / _FILE, {"low": low.tolist(), "high": high.tolist()})
 
 
-def _checked(low: Any, high: Any) -> tuple[torch.Tensor, torch.Tensor]:
+def check_action_bounds(low: Any, high: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    """Raises if numbers are not bounds of actions.
+
+    Args:
+        low (torch.Tensor or sequence of float): the lowest action, ``[A]``.
+        high (torch.Tensor or sequence of float): the highest action, ``[A]``.
+
+    Returns:
+        tuple of torch.Tensor: both, float32 ``[A]``.
+
+    Raises:
+        ValueError: a bound is not finite, a lower one is above a higher one, or they
+            have different shapes.
+
+    Examples:
+        >>> from torchrl_caiac.data.action_bounds import check_action_bounds
+        >>> check_action_bounds([-1, -1], [1, 2])
+        (tensor([-1., -1.]), tensor([1., 2.]))
+    """
     low, high = (torch.as_tensor(x, dtype=torch.float32) for x in (low, high))
     if low.shape != high.shape or not low.ndim:
         raise ValueError(

@@ -7,31 +7,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from tqdm.auto import tqdm
 
-from torchrl_caiac._files import UnreadableFileError, reserve
+from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._keys import path as path_of
-from torchrl_caiac.data.action_bounds import write_action_bounds
-from torchrl_caiac.data.digests import (
-    data_source,
-    file_digest,
-    has_digests,
-    write_digests,
-)
+from torchrl_caiac.data.digests import data_source, file_digest, has_digests
+from torchrl_caiac.data.episodes import episode_transitions
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.minari_checks import episode_lengths
 from torchrl_caiac.data.minari_files import open_minari
-from torchrl_caiac.data.write_transitions import (
-    check_entries,
-    check_free,
-    whole_transitions,
-)
+from torchrl_caiac.data.transition_writer import TransitionWriter
+from torchrl_caiac.data.write_transitions import check_free
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -41,9 +30,7 @@ __all__ = ["load_minari"]
 
 _logger = logging.getLogger("torchrl_caiac.data.load_minari")
 
-# The names that entries of an observation must not have.
-_TAKEN = {"action", "done", "episode", "info", "next"}
-_TAKEN |= {"reward", "terminated", "truncated"}
+_REMOVE = "remove the episode with MinariDataset.filter_episodes"
 
 
 def load_minari(
@@ -152,13 +139,17 @@ def load_minari(
     left_out = {path_of(as_key(key)) for key in exclude}
     source = _source(dataset)
     _warn_of_other_source(path, source)
-    with whole_transitions(path) as folder:
-        _fill(dataset, lengths, folder, columns, infos, left_out, progress)
-        write_digests(folder, source=source)
-        space = dataset.action_space
-        is_box = isinstance(space, gymnasium.spaces.Box)
-        if is_box and space.shape and space.is_bounded():
-            write_action_bounds(folder, space.low, space.high)
+    space = dataset.action_space
+    is_box = isinstance(space, gymnasium.spaces.Box)
+    is_bounded = is_box and space.shape and space.is_bounded()
+    with TransitionWriter(
+        path,
+        overwrite=overwrite,
+        action_bounds=(space.low, space.high) if is_bounded else None,
+        source=source,
+        rows=sum(lengths),
+    ) as writer:
+        _fill(dataset, lengths, writer, columns, infos, left_out, progress)
     return load_transitions(path)
 
 
@@ -212,14 +203,12 @@ def _episodes(dataset: MinariDataset) -> Iterator[EpisodeData]:
 def _fill(
     dataset: MinariDataset,
     lengths: Sequence[int],
-    folder: Path,
+    writer: TransitionWriter,
     columns: Sequence[int] | None,
     infos: Sequence[str],
     left_out: set[tuple[str, ...]],
     progress: bool,
 ) -> None:
-    rows: TensorDict | None = None
-    first = 0
     bar = tqdm(
         zip(_episodes(dataset), lengths, strict=True),
         total=len(lengths),
@@ -227,29 +216,11 @@ def _fill(
         unit="episode",
         disable=not progress,
     )
-    for number, (episode, length) in enumerate(bar):
-        part = _transitions(episode, length, columns, infos, left_out, dataset.id)
-        part["episode"] = torch.full((length,), number)
-        if rows is None:
-            check_entries(part, dataset.id)
-            rows = part[:1].expand(sum(lengths)).memmap_like(folder)
-            reserve(folder)
-        # A memmap silently broadcasts, casts or ignores entries that do not fit.
-        differ = {leaf[0] for leaf in _structure(part) ^ _structure(rows)}
-        if differ:
-            raise ValueError(
-                f"episode {episode.id} of {dataset.id} and the first one differ in the "
-                f"shapes or types of {sorted(differ, key=str)}: load them separately"
-            )
-        rows[first : first + length] = part
-        first += length
-
-
-def _structure(rows: TensorDictBase) -> set[tuple[Any, ...]]:
-    return {
-        (key, leaf.dtype, tuple(leaf.shape[1:]))
-        for key, leaf in rows.items(include_nested=True, leaves_only=True)
-    }
+    for episode, length in bar:
+        where = f"episode {episode.id} of {dataset.id}"
+        writer.add(
+            _transitions(episode, length, columns, infos, left_out, where), where=where
+        )
 
 
 def _transitions(
@@ -258,27 +229,15 @@ def _transitions(
     columns: Sequence[int] | None,
     infos: Sequence[str],
     left_out: set[tuple[str, ...]],
-    dataset_id: str,
+    where: str,
 ) -> TensorDict:
-    where = f"episode {episode.id} of {dataset_id}"
     if length < 1:
         raise ValueError(f"{where} has no steps: filter it out of the dataset")
     states = episode.observations
     if not isinstance(states, Mapping) or "observation" not in states:
         states = {"observation": states}
-    taken = sorted(_TAKEN & set(states))
-    if taken:
-        raise ValueError(
-            f"the observations in {where} have entries named {taken}, which are keys "
-            "of transitions: rename them in the dataset"
-        )
     if columns is not None:
         states = {**states, "observation": _columns(states, columns, where)}
-    flags = {
-        "reward": episode.rewards,
-        "terminated": episode.terminations,
-        "truncated": episode.truncations,
-    }
     kept = {}
     for name in infos:
         if name not in (episode.infos or {}):
@@ -294,31 +253,34 @@ def _transitions(
             f"{where} has no {unknown}, its observations and infos have "
             f"{sorted(known)}: correct exclude="
         )
-    states = _without(states, left_out)
     kept = _without(kept, {key[1:] for key in left_out if key[0] == "info"})
-    td = TensorDict(
-        {
-            **_tensors(states, length + 1, where, slice(0, length)),
-            **_tensors({"action": episode.actions}, length, where),
-            "next": {
-                **_tensors(states, length + 1, where, slice(1, length + 1)),
-                **{
-                    key: value.reshape(length, 1)
-                    for key, value in _tensors(flags, length, where).items()
-                },
-            },
-        },
-        [length],
+    _check_infos(kept, length + 1, where)
+    return episode_transitions(
+        _without(states, left_out),
+        episode.actions,
+        where=where,
+        rewards=episode.rewards,
+        terminated=episode.terminations,
+        truncated=episode.truncations,
+        info=kept,
+        remove=_REMOVE,
+        leave_out="pass exclude=[{key!r}]",
     )
-    if kept:
-        td["info"] = _tensors(
-            kept, length + 1, where, slice(0, length), cast=False, above=("info",)
-        )
-    for key in ("terminated", "truncated"):
-        td["next", key] = td["next", key].bool()
-    td["next", "truncated"][-1] |= ~td["next", "terminated"][-1]
-    td["next", "done"] = td["next", "terminated"] | td["next", "truncated"]
-    return td
+
+
+def _check_infos(
+    infos: Mapping[str, Any], states: int, where: str, above: tuple[str, ...] = ()
+) -> None:
+    """Raises if an entry has no value for each state, such as one for each action."""
+    for name, value in infos.items():
+        key = (*above, name)
+        if isinstance(value, Mapping):
+            _check_infos(value, states, where, key)
+        elif len(value) != states:
+            raise ValueError(
+                f"{('info', *key)!r} in {where} has {len(value)} entries, expected "
+                f"{states}: {_REMOVE}, or leave it out of infos="
+            )
 
 
 def _columns(states: Mapping[str, Any], columns: Sequence[int], where: str) -> Any:
@@ -355,58 +317,3 @@ def _without(
         for key, value in tree.items()
         if (*above, key) not in keys
     }
-
-
-def _tensors(
-    tree: Mapping[str, Any],
-    length: int,
-    where: str,
-    part: slice = slice(None),
-    *,
-    cast: bool = True,
-    above: tuple[str, ...] = (),
-) -> dict[str, Any]:
-    result: dict[str, Any] = {}
-    for name, value in tree.items():
-        key = (*above, name) if above else name
-        if isinstance(value, Mapping):
-            inner = (*above, name)
-            result[name] = _tensors(value, length, where, part, cast=cast, above=inner)
-            continue
-        if isinstance(value, tuple):
-            raise ValueError(
-                f"{key!r} in {where} is a tuple of spaces, which has no keys: "
-                f"convert it to a dict, or pass exclude=[{key!r}]"
-            )
-        array = _numbers(value, key, where)
-        entries = len(array) if array.ndim else "no"
-        if entries != length:
-            raise ValueError(
-                f"{key!r} in {where} has {entries} entries, expected {length}: remove "
-                "the episode"
-            )
-        if np.issubdtype(array.dtype, np.floating):
-            with np.errstate(over="ignore"):
-                array = array.astype(np.float32) if cast else array
-            if not np.isfinite(array).all():
-                raise ValueError(
-                    f"{key!r} in {where} has NaN or infinite values (as float32): "
-                    "remove the episode with MinariDataset.filter_episodes"
-                )
-        # Copied, because Minari may return read-only arrays.
-        result[name] = torch.from_numpy(np.array(array[part]))
-    return result
-
-
-def _numbers(value: Any, key: NestedKey, where: str) -> NDArray[Any]:
-    try:
-        array = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        array = np.empty(0, object)
-    if array.dtype.kind not in "biuf" or array.dtype == np.longdouble:
-        kind = {"O": "Python objects", "S": "bytes", "U": "text"}.get(array.dtype.kind)
-        raise ValueError(
-            f"{key!r} in {where} has {kind or array.dtype}, expected numbers: pass "
-            f"exclude=[{key!r}], or convert it in the dataset"
-        )
-    return array

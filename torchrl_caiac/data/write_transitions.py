@@ -18,7 +18,13 @@ from torchrl_caiac.data.action_bounds import write_action_bounds
 from torchrl_caiac.data.digests import write_digests
 from torchrl_caiac.data.load_transitions import check_transitions, load_transitions
 
-__all__ = ["check_entries", "check_free", "whole_transitions", "write_transitions"]
+__all__ = [
+    "check_bounds_fit",
+    "check_entries",
+    "check_free",
+    "whole_transitions",
+    "write_transitions",
+]
 
 # Under these names, tensordict writes its own entries to meta.json.
 _RESERVED = {"_type", "device", "shape"}
@@ -185,7 +191,7 @@ def write_transitions(
     check_transitions(data)
     check_entries(data)
     if action_bounds is not None:
-        _check_bounds(data, action_bounds)
+        check_bounds_fit(data, action_bounds)
     with whole_transitions(path) as folder:
         stored = data.memmap_like(folder)
         reserve(folder)
@@ -196,7 +202,23 @@ def write_transitions(
     return load_transitions(Path(path))
 
 
-def _check_bounds(data: TensorDictBase, bounds: tuple[Any, Any]) -> None:
+def check_bounds_fit(data: TensorDictBase, bounds: tuple[Any, Any]) -> None:
+    """Raises if bounds do not have the shape of an action.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        bounds (tuple): the lowest and the highest action, ``[A]`` each.
+
+    Raises:
+        ValueError: they have another shape.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.write_transitions import check_bounds_fit
+        >>> rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+        >>> check_bounds_fit(rows, ([-1, -1], [1, 1]))
+    """
     action, shape = data.get("action", None), list(torch.as_tensor(bounds[0]).shape)
     if action is not None and list(action.shape[data.batch_dims :]) != shape:
         raise ValueError(

@@ -12,6 +12,7 @@ from torchrl_caiac.influence.metrics import (
     roc_auc,
 )
 from torchrl_caiac.influence.mixture_divergence import causal_action_influence
+from torchrl_caiac.influence.motion import MotionInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
@@ -27,6 +28,7 @@ __all__ = [
     "AttentionInfluence",
     "DistanceInfluence",
     "EntityReport",
+    "MotionInfluence",
     "ScoreOnWrite",
     "SimulatorInfluence",
     "TrueInfluence",

@@ -1,0 +1,281 @@
+"""How much the columns of an entity change while it rests, and while it moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
+
+from torchrl_caiac._layout_units import position_features
+from torchrl_caiac._torchrl import storage_rows
+from torchrl_caiac.entities import EntityLayout
+
+__all__ = ["EntityNoise", "resting_noise"]
+
+_SHARE = 0.1  # of the median change while it moves: smaller changes do not matter
+_DEVIATIONS = 4.0  # of the noise: larger changes are motion
+_LARGE = 0.999  # the quantile of the changes that stands for fast motion
+_STILL = 1e-2  # of fast motion: an entity that changes less rests
+_BINS = 120
+_SPREAD = 0.1  # decades: the smallest deviation of a mode
+# Nats for each row of the smaller mode, by which two modes must explain the data better
+# than one. The sizes of one Gaussian reach 1.2.
+_GAIN = 1.4
+_FEWEST = 5  # rows in a mode
+
+
+@dataclass(frozen=True)
+class EntityNoise:
+    """How the columns of an entity change, see :func:`resting_noise`.
+
+    Args:
+        floor (tuple of float): for each of its ``W`` features the standard deviation
+            below which a change does not matter.
+        tolerance (tuple of float): for each feature the largest change that is noise.
+        noise (tuple of float): the root mean square of the changes while it rests,
+            without the largest 1 %; NaN if it never rests.
+        moving (tuple of float): the median size of the changes while it moves, NaN if
+            it never moves.
+        rest_share (float): the share of the rows in which it rests.
+        reason (str): how the floor was found.
+    """
+
+    floor: tuple[float, ...]
+    tolerance: tuple[float, ...]
+    noise: tuple[float, ...]
+    moving: tuple[float, ...]
+    rest_share: float
+    reason: str
+
+
+def resting_noise(
+    data: TensorDictBase | ReplayBuffer,
+    layout: EntityLayout,
+    *,
+    max_rows: int = 100_000,
+) -> dict[str, EntityNoise]:
+    """Measures the noise of every entity at rest, and the size of its motion.
+
+    An entity's changes from a state to the next one have two modes if it both rests and
+    moves. They are told apart on a logarithmic scale, by the split with the smallest
+    classification error of two Gaussians (Kittler and Illingworth, 1986). The changes
+    are those of ``layout.positions`` if they are known, else of all columns, each
+    divided by its 99.9 % quantile.
+
+    The floor of a column is the largest of three numbers: the noise at rest, a tenth of
+    the median change while the entity moves, and the resolution of the numbers.
+    The tolerance is the same with four times the noise, and at least the 99.9 %
+    quantile of the changes at rest.
+
+    Args:
+        data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
+        layout (EntityLayout): the entities.
+
+    Keyword Args:
+        max_rows (int): the number of rows to read, evenly spaced. Defaults to 100,000.
+
+    Returns:
+        dict of str to EntityNoise: the noise of each entity, in layout order.
+
+    Raises:
+        KeyError: the state or the next state is missing.
+        ValueError: there are no rows, or the data have NaN or infinite values.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.noise import resting_noise
+        >>> change = torch.full((100, 1), 0.5)
+        >>> change[:60] = 0.001 * (-1) ** torch.arange(60).view(60, 1)
+        >>> data = TensorDict(
+        ...     {
+        ...         "observation": torch.zeros(100, 1),
+        ...         ("next", "observation"): change,
+        ...     },
+        ...     [100],
+        ... )
+        >>> cup = resting_noise(data, EntityLayout({"cup": [0]}))["cup"]
+        >>> print(cup.reason)
+        rests in 60.0 % of 100 rows with noise 0.001; changes by 0.5 (median) where it
+        moves, of which a tenth is the floor
+        >>> round(cup.floor[0], 4), round(cup.noise[0], 4)
+        (0.05, 0.001)
+    """
+    rows = _sample(data, max_rows)
+    layout.check(rows, next=True)
+    now = layout.read(rows).double().flatten(0, -2)
+    after = layout.read(rows, next=True).double().flatten(0, -2)
+    change = (after - now).abs()
+    if not bool(change.isfinite().all()):
+        bad = [
+            name
+            for name, where in layout.slices(rows).items()
+            if not bool(change[:, where].isfinite().all())
+        ]
+        raise ValueError(
+            f"the states or next states of {bad} have NaN or infinite values: remove "
+            "or repair these rows"
+        )
+    # Rounding of the stored numbers, which are mostly float32.
+    rounding = torch.finfo(torch.float32).eps * torch.maximum(
+        now.abs().amax(0), after.abs().amax(0)
+    )
+    result = {}
+    for name, where in layout.slices(rows).items():
+        columns = position_features(layout, name, where.stop - where.start)
+        result[name] = _entity(change[:, where], rounding[where], columns)
+    return result
+
+
+def _sample(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBase:
+    if isinstance(max_rows, bool) or not isinstance(max_rows, int) or max_rows < 1:
+        raise ValueError(f"max_rows must be an int of at least 1, got {max_rows!r}")
+    if isinstance(data, ReplayBuffer):
+        storage = data.storage
+        data = storage_rows(storage)[: len(storage)]
+    elif data.batch_dims > 1:
+        data = data.reshape(-1)
+    if not data.batch_dims or not len(data):
+        raise ValueError(
+            f"the data have batch size {list(data.batch_size)}, expected at least one "
+            "row: collect or load transitions first"
+        )
+    if len(data) <= max_rows:
+        return data
+    return data[torch.linspace(0, len(data) - 1, max_rows).round().long()]
+
+
+def _entity(
+    change: torch.Tensor, rounding: torch.Tensor, columns: list[int]
+) -> EntityNoise:
+    """Measures one entity from the sizes ``[n, W]`` of its changes."""
+    count, width = change.shape
+    resolution = torch.stack(
+        [_resolution(c, float(r)) for c, r in zip(change.T, rounding, strict=True)]
+    )
+    large = torch.stack([_quantile(c, _LARGE) for c in change.T])
+    varies = large > resolution
+    tell = [c for c in columns if bool(varies[c])]
+    nan = torch.full((width,), math.nan, dtype=change.dtype)
+    rests = torch.ones(count, dtype=torch.bool)
+    if not tell:
+        noise, moving = change.square().mean(0).sqrt(), nan
+        reason = f"never moves in {count} rows"
+    else:
+        size = (change[:, tell] / large[tell]).amax(1)
+        split = _split((size + _STILL).log10())
+        if split is None:
+            rests = (change[:, tell] <= resolution[tell]).all(1)
+        else:
+            rests = size <= 10.0**split - _STILL
+        noise = _typical(change[rests]) if bool(rests.any()) else nan
+        moves = change[~rests]
+        moving = torch.where(varies, moves.median(0).values, nan)
+        reason = ""
+    zero = torch.zeros_like(nan)
+    part = _SHARE * torch.where(moving.isnan(), zero, moving)
+    quiet = torch.where(noise.isnan(), zero, noise)
+    least = torch.maximum(part, resolution)
+    floor = torch.maximum(quiet, least)
+    tolerance = torch.maximum(_DEVIATIONS * quiet, least)
+    if bool(rests.any()):
+        at_rest = torch.stack([_quantile(c, _LARGE) for c in change[rests].T])
+        tolerance = torch.maximum(tolerance, at_rest)
+    if not reason:
+        reason = _reason(rests, noise, moving, floor, resolution, tell)
+    return EntityNoise(
+        floor=tuple(floor.tolist()),
+        tolerance=tuple(tolerance.tolist()),
+        noise=tuple(noise.tolist()),
+        moving=tuple(moving.tolist()),
+        rest_share=float(rests.double().mean()),
+        reason=reason,
+    )
+
+
+def _reason(
+    rests: torch.Tensor,
+    noise: torch.Tensor,
+    moving: torch.Tensor,
+    floor: torch.Tensor,
+    resolution: torch.Tensor,
+    tell: list[int],
+) -> str:
+    c = max(tell, key=lambda column: float(floor[column]))
+    share = float(rests.double().mean())
+    first = f"rests in {100 * share:.1f} % of {len(rests)} rows"
+    first += f" with noise {noise[c]:.3g}" if share else ""
+    then = f"changes by {moving[c]:.3g} (median) where it moves"
+    if floor[c] == noise[c]:
+        return f"{then}; {first}, which is the floor"
+    if floor[c] == resolution[c]:
+        return f"{first}; {then}; the resolution {resolution[c]:.3g} is the floor"
+    return f"{first}; {then}, of which a tenth is the floor"
+
+
+def _typical(change: torch.Tensor) -> torch.Tensor:
+    """Returns the root mean square of changes ``[n, W]`` without the largest 1 %."""
+    kept = max(1, math.floor(0.99 * len(change)))
+    return change.sort(0).values[:kept].square().mean(0).sqrt()
+
+
+def _quantile(values: torch.Tensor, share: float) -> torch.Tensor:
+    """Returns a quantile, or the largest value if the quantile is zero."""
+    found = values.kthvalue(max(1, math.ceil(share * len(values)))).values
+    return found if bool(found > 0) else values.amax()
+
+
+def _resolution(change: torch.Tensor, rounding: float) -> torch.Tensor:
+    """Returns the step of a column whose values lie on a grid, else its rounding."""
+    smallest = torch.finfo(torch.float32).tiny
+    least = change.new_tensor(max(4 * rounding, smallest))
+    nonzero = change[change > least]
+    if len(nonzero) < _FEWEST:
+        return least
+    step = nonzero.amin()
+    steps = nonzero / step
+    # A flag that is 0 or 1 changes by one step alone, and that is motion.
+    if bool((steps - steps.round()).abs().mean() < 1e-2) and bool(steps.amax() > 1.5):
+        return torch.maximum(step, least)
+    return least
+
+
+def _split(values: torch.Tensor) -> float | None:
+    """Returns the split between two modes ``[n]``, ``None`` if there is one mode."""
+    low, high = float(values.amin()), float(values.amax())
+    if high - low < 2 * _SPREAD:
+        return None
+    edges = torch.linspace(low, high, _BINS + 1, dtype=values.dtype)
+    count = torch.histc(values, _BINS, low, high)
+    center = (edges[:-1] + edges[1:]) / 2
+    n0 = count.cumsum(0)[:-1]
+    n1 = len(values) - n0
+    total, total_square = (count * center).sum(), (count * center.square()).sum()
+    s0, q0 = (
+        (count * center).cumsum(0)[:-1],
+        (count * center.square()).cumsum(0)[:-1],
+    )
+
+    def log_deviation(
+        n: torch.Tensor, s: torch.Tensor, q: torch.Tensor
+    ) -> torch.Tensor:
+        n = n.clamp_min(1)
+        variance = (q / n - (s / n).square()).clamp_min(_SPREAD**2)
+        return 0.5 * variance.log()
+
+    share0, share1 = n0 / len(values), n1 / len(values)
+    cost = share0 * (log_deviation(n0, s0, q0) - share0.log())
+    cost += share1 * (log_deviation(n1, total - s0, total_square - q0) - share1.log())
+    cost[(n0 < _FEWEST) | (n1 < _FEWEST)] = math.inf
+    one = log_deviation(values.new_tensor(len(values)), total, total_square)
+    best = int(cost.argmin())
+    smaller = torch.minimum(share0, share1)[best]
+    if not bool(one - cost[best] > _GAIN * smaller):
+        return None
+    # The middle of the empty bins between the modes, if there are any.
+    lowest = (cost <= cost[best] + 1e-9).nonzero()[:, 0]
+    return float((edges[1 + int(lowest[0])] + edges[1 + int(lowest[-1])]) / 2)
