@@ -93,9 +93,7 @@ def draw_examples(
         elsewhere, swapped = moved[sample], swaps.swapped[sample]
         moved_names = tuple(names[(swapped & elsewhere).numpy()])
         kept = tuple(
-            name
-            for name in names[influenced[row].numpy()]
-            if name not in layout.fixed
+            name for name in names[influenced[row].numpy()] if name not in layout.fixed
         )
         description = (
             "A recorded state and its counterfactual. Swapped: "

@@ -19,7 +19,7 @@ from torchrl_caiac.report.svg import (
     short_label,
     svg_text,
 )
-from torchrl_caiac.report.swaps import CELLS, PairCoverage
+from torchrl_caiac.report.swaps import Cells, PairCoverage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,7 +124,9 @@ def draw_scores(
     edges = np.linspace(low, high, 37)
     width = edges[1] - edges[0]
     if threshold > 0:  # an edge at the threshold: no bar has both colours
-        edges += np.log10(threshold) - edges[np.abs(edges - np.log10(threshold)).argmin()]
+        edges += (
+            np.log10(threshold) - edges[np.abs(edges - np.log10(threshold)).argmin()]
+        )
         edges = np.concatenate([[edges[0] - width], edges, [edges[-1] + width]])
     with drawing():
         figure = new_figure(_NARROW, 2.0)
@@ -191,21 +193,35 @@ def draw_coverage(pair: PairCoverage, *, name: str, description: str) -> str:
         str: the ``<svg>`` element.
     """
     before, after = pair.before.numpy(), pair.after.numpy()
-    x, y = (edges.numpy() for edges in pair.edges)
     with drawing():
         figure = new_figure(_NARROW, 3.1)
         axes = figure.add_subplot()
+        edges = []
+        for own, side in zip(pair.cells, (1, 0), strict=True):
+            if own.edges is not None:
+                edges.append(own.edges.numpy())
+                continue
+            # Cells of a plane have no order: those that were never recorded are left
+            # out.
+            visited = before.any(side)
+            before, after = (x.compress(visited, 1 - side) for x in (before, after))
+            edges.append(np.arange(int(visited.sum()) + 1.0))
+        x, y = edges
         # The first entity is on the horizontal axis: a row of cells is a column here.
         for cells, colour in ((before, RECORDED), (after & ~before, ADDED)):
-            for j in range(CELLS):
+            for j in range(cells.shape[1]):
                 bars = [(x[a], x[b] - x[a]) for a, b in true_ranges(cells[:, j])]
                 if bars:
                     axes.broken_barh(bars, (y[j], y[j + 1] - y[j]), facecolor=colour)
         axes.set_xlim(x[0], x[-1])
         axes.set_ylim(y[0], y[-1])
-        axes.set_xlabel(_place_label(pair.names[0], pair.labels[0]))
-        axes.set_ylabel(_place_label(pair.names[1], pair.labels[1], 22))
         axes.locator_params(nbins=5)
+        axes.set_xlabel(_cells_label(pair.cells[0], 40))
+        axes.set_ylabel(_cells_label(pair.cells[1], 30))
+        if pair.cells[0].edges is None:
+            axes.set_xticks([])
+        if pair.cells[1].edges is None:
+            axes.set_yticks([])
         return svg_text(figure, name, description)
 
 
@@ -254,45 +270,30 @@ def draw_plan(
     Returns:
         str: the ``<svg>`` element.
     """
+    points = np.concatenate([*background.values()])
+    # The wider of the first two coordinates is horizontal.
+    axis = [0, 1] if np.ptp(points[:, 0]) >= np.ptp(points[:, 1]) else [1, 0]
     with drawing():
-        figure = new_figure(_WIDTH, 3.3)
+        figure = new_figure(_WIDTH, 3.0)
         axes = figure.add_subplot()
-        for points in background.values():
-            axes.plot(
-                points[:, 0], points[:, 1], ".", color=MUTED, markersize=1.2, alpha=0.35
-            )
-        for entity, (recorded, made, swapped) in marks.items():
+        axes.plot(*points[:, axis].T, ".", color=MUTED, markersize=1.2, alpha=0.35)
+        for number, (entity, (recorded, made, swapped)) in enumerate(marks.items()):
+            before, after = recorded[axis], made[axis]
             if swapped:
-                axes.annotate(
-                    "",
-                    made[:2],
-                    recorded[:2],
-                    arrowprops={
-                        "arrowstyle": "->",
-                        "color": ADDED,
-                        "shrinkA": 6,
-                        "shrinkB": 7,
-                        "linewidth": 1.2,
-                    },
-                )
-                axes.plot(*recorded[:2], "o", color=RECORDED, markersize=7, fillstyle="none")
-                axes.plot(*made[:2], "o", color=ADDED, markersize=8, zorder=4)
-                axes.plot(
-                    *made[:2], "o", color=INK, markersize=11, fillstyle="none", zorder=5
-                )
-            else:
-                axes.plot(*recorded[:2], "o", color=RECORDED, markersize=8, zorder=3)
+                _arrow(axes, before, after)
+            _dots(axes, before, after, swapped)
             axes.annotate(
                 short_label(entity, 16),
-                made[:2],
-                xytext=(0, 9),
+                after,
+                # Above and below in turn, as two entities may be close.
+                xytext=(0, -17 if number % 2 else 9),
                 textcoords="offset points",
                 ha="center",
                 fontsize=9,
                 zorder=6,
             )
-        axes.set_xlabel("first coordinate")
-        axes.set_ylabel("second coordinate")
+        axes.set_xlabel(f"{('first', 'second')[axis[0]]} coordinate")
+        axes.set_ylabel(f"{('first', 'second')[axis[1]]} coordinate")
         axes.margins(0.12)
         axes.set_aspect("equal", adjustable="datalim")
         axes.locator_params(nbins=5)
@@ -332,13 +333,7 @@ def draw_marks(
             axes.plot([0, 1], [row, row], color=GRID, linewidth=4, zorder=1)
             if swapped:
                 axes.plot([before, after], [row, row], color=ADDED, linewidth=1.2)
-                axes.plot(before, row, "o", color=RECORDED, markersize=7, fillstyle="none")
-                axes.plot(after, row, "o", color=ADDED, markersize=8, zorder=4)
-                axes.plot(
-                    after, row, "o", color=INK, markersize=11, fillstyle="none", zorder=5
-                )
-            else:
-                axes.plot(before, row, "o", color=RECORDED, markersize=8, zorder=3)
+            _dots(axes, (before, row), (after, row), swapped)
         axes.set_yticks(
             range(len(marks)), [short_label(entity, 18) for entity in marks]
         )
@@ -350,13 +345,34 @@ def draw_marks(
         return svg_text(figure, name, description)
 
 
+def _dots(axes: Axes, before: Any, after: Any, swapped: bool) -> None:
+    if not swapped:
+        axes.plot(*before, "o", color=RECORDED, markersize=8, zorder=3)
+        return
+    axes.plot(*before, "o", color=RECORDED, markersize=7, fillstyle="none", zorder=3)
+    axes.plot(*after, "o", color=ADDED, markersize=8, zorder=4)
+    axes.plot(*after, "o", color=INK, markersize=11, fillstyle="none", zorder=5)
+
+
+def _arrow(axes: Axes, before: Any, after: Any) -> None:
+    look = {
+        "arrowstyle": "->",
+        "color": ADDED,
+        "shrinkA": 6,
+        "shrinkB": 7,
+        "linewidth": 1.2,
+    }
+    axes.annotate("", after, before, arrowprops=look)
+
+
 def _compressed(values: NDArray[Any], unit: float) -> NDArray[Any]:
     return np.sign(values) * np.log1p(np.abs(values) / unit)
 
 
-def _place_label(entity: str, feature: str, most: int = 30) -> str:
-    text = short_label(entity, most)
-    return f"{text}, {short_label(feature, most)}"
+def _cells_label(cells: Cells, most: int) -> str:
+    if cells.edges is None:
+        return f"places of {short_label(cells.name, most - 10)}"
+    return short_label(f"{short_label(cells.name, 18)}, {cells.labels[0]}", most)
 
 
 def _whole_steps(axes: Axes) -> None:

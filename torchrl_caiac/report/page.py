@@ -8,6 +8,7 @@ from typing import Any
 
 import torchrl_caiac
 from torchrl_caiac.report.contents import ReportContents, ReportSettings
+from torchrl_caiac.report.swaps import CELLS, PLANE
 from torchrl_caiac.scored import ScoredDataset
 
 __all__ = ["page_text", "settings_rows", "share_text", "usage_code"]
@@ -58,6 +59,8 @@ def page_text(
         version=torchrl_caiac.__version__,
         style=Markup((_FOLDER / "page.css").read_text(encoding="utf-8")),
         svg=Markup,  # what this package drew, already escaped
+        cells=CELLS,
+        plane=PLANE,
         code=usage_code(scored),
         source_rows=settings_rows(scored.source),
         setting_rows=settings_rows(scored.settings),

@@ -18,6 +18,8 @@ from torchrl_caiac.transforms import CAIACTransform
 
 __all__ = [
     "CELLS",
+    "PLANE",
+    "Cells",
     "PairCoverage",
     "SampledSwaps",
     "choose_examples",
@@ -28,6 +30,8 @@ __all__ = [
 
 #: The number of intervals into which the range of a position is divided.
 CELLS = 20
+#: The number of intervals of each of two coordinates.
+PLANE = 8
 _BATCH = 512
 _NOISE = 2  # times the floor of the layout, what may still be noise
 _OUTLIERS = 0.005  # the share of positions below and above the range
@@ -130,29 +134,57 @@ def sample_swaps(
 
 
 @dataclass(frozen=True)
+class Cells:
+    """The places of an entity, divided into cells.
+
+    An entity at a point in space has :data:`PLANE` by :data:`PLANE` cells, of the two
+    coordinates that vary most. Any other one has :data:`CELLS` intervals of the
+    position that varies most.
+
+    Attributes:
+        name (str): the entity.
+        labels (tuple of str): the features that were divided.
+        edges (torch.Tensor, optional): float64 ``[CELLS + 1]``, the ends of intervals;
+            ``None`` for cells of a plane.
+        recorded (torch.Tensor): int64 ``[M]``, the cell of each recorded sample.
+        made (torch.Tensor): int64 ``[M]``, the cell of each sample after swapping.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    edges: torch.Tensor | None
+    recorded: torch.Tensor
+    made: torch.Tensor
+
+    @property
+    def count(self) -> int:
+        """The number of cells."""
+        return PLANE**2 if self.edges is None else CELLS
+
+
+@dataclass(frozen=True)
 class PairCoverage:
     """Which places of two entities occur together, before and after swapping.
 
-    The range of each entity's position is divided into :data:`CELLS` intervals, and two
-    entities make a grid. A combination is *possible* if each of its intervals is
-    occupied by its own entity in some recorded sample.
-
     Attributes:
-        names (pair of str): the entities.
-        labels (pair of str): the features that stand for their positions.
-        edges (pair of torch.Tensor): float64 ``[CELLS + 1]`` each.
-        before (torch.Tensor): bool ``[CELLS, CELLS]``, the recorded combinations; the
-            first dimension is that of the first entity.
-        after (torch.Tensor): bool ``[CELLS, CELLS]``, those after swapping.
-        possible (int): the number of possible combinations.
+        cells (pair of Cells): the places of the two entities.
+        before (torch.Tensor): bool ``[C0, C1]``, the recorded combinations of cells.
+        after (torch.Tensor): bool ``[C0, C1]``, those after swapping.
     """
 
-    names: tuple[str, str]
-    labels: tuple[str, str]
-    edges: tuple[torch.Tensor, torch.Tensor]
+    cells: tuple[Cells, Cells]
     before: torch.Tensor
     after: torch.Tensor
-    possible: int
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The entities."""
+        return self.cells[0].name, self.cells[1].name
+
+    @property
+    def possible(self) -> int:
+        """The number of combinations of two cells that were both recorded."""
+        return int(self.before.any(1).sum() * self.before.any(0).sum())
 
     @property
     def share_before(self) -> float:
@@ -170,7 +202,6 @@ def pair_coverage(
 ) -> list[PairCoverage]:
     """Compares the combinations of places in recorded and in sampled states.
 
-    One feature stands for the place of an entity: the position that varies most.
     Left out are pairs of fixed entities, and entities that never move: whose positions
     all stay within four times the noise of the layout's ``variance_floor``.
 
@@ -191,50 +222,34 @@ def pair_coverage(
         >>> swaps = SampledSwaps(
         ...     torch.arange(2), recorded, torch.tensor([[0.0, 1.0], [1.0, 1.0]]),
         ...     flags[:, 1], flags, 0)
-        >>> places = {"arm": Place((0,), ("x",), (0.0,)), "cup": Place((1,), ("y",), (0.0,))}
+        >>> places = {
+        ...     "arm": Place((0,), ("x",), (0.0,)), "cup": Place((1,), ("y",), (0.0,))}
         >>> pair = pair_coverage(swaps, places, frozenset(["arm"]))[0]
-        >>> pair.share_before, pair.share_after
-        (0.5, 0.5)
+        >>> pair.possible, pair.share_before, pair.share_after
+        (4, 0.5, 0.5)
     """
-    grids = {}
-    for name, place in places.items():
-        grid = _grid(swaps, place)
-        if grid is not None:
-            grids[name] = grid
+    cells = [
+        found
+        for name, place in places.items()
+        if (found := _cells(swaps, name, place)) is not None
+    ]
     pairs = []
-    for first, second in combinations(grids, 2):
-        if first in fixed and second in fixed:
+    for a, b in combinations(cells, 2):
+        if a.name in fixed and b.name in fixed:
             continue
-        a, b = grids[first], grids[second]
-        before = torch.zeros(CELLS, CELLS, dtype=torch.bool)
+        before = torch.zeros(a.count, b.count, dtype=torch.bool)
         after = before.clone()
-        before[a.before, b.before] = True
-        after[a.after, b.after] = True
-        pairs.append(
-            PairCoverage(
-                (first, second),
-                (a.label, b.label),
-                (a.edges, b.edges),
-                before,
-                after,
-                int(before.any(1).sum() * before.any(0).sum()),
-            )
-        )
+        before[a.recorded, b.recorded] = True
+        after[a.made, b.made] = True
+        pairs.append(PairCoverage((a, b), before, after))
     return sorted(pairs, key=lambda p: p.share_before - p.share_after)
 
 
-@dataclass(frozen=True)
-class _Grid:
-    label: str
-    edges: torch.Tensor
-    before: torch.Tensor  # int64 [M], the interval of each recorded sample
-    after: torch.Tensor
-
-
-def _grid(swaps: SampledSwaps, place: Place) -> _Grid | None:
-    """Divides the range of an entity's place; ``None`` if it never changes."""
-    recorded = swaps.recorded[:, list(place.features)].double()
-    ordered = recorded.sort(0).values
+def _cells(swaps: SampledSwaps, name: str, place: Place) -> Cells | None:
+    """Divides the places of an entity; ``None`` if it never moves."""
+    features = list(place.features)
+    recorded, made = swaps.recorded[:, features], swaps.made[:, features]
+    ordered = recorded.double().sort(0).values
     limits = torch.tensor([_OUTLIERS, 1 - _OUTLIERS], dtype=torch.float64)
     low, high = ordered[(limits * (len(ordered) - 1)).round().long()]
     least = 2 * _NOISE * torch.tensor(place.floors, dtype=torch.float64)
@@ -242,15 +257,26 @@ def _grid(swaps: SampledSwaps, place: Place) -> _Grid | None:
         low, high = ordered[0], ordered[-1]  # it may move in outliers alone
         if not (high - low > least).any():
             return None
-    widest = int((high - low).argmax())
-    edges = torch.linspace(low[widest], high[widest], CELLS + 1, dtype=torch.float64)
+    widest = (high - low).argsort(descending=True, stable=True).tolist()
 
-    def cells(values: torch.Tensor) -> torch.Tensor:
+    def divided(values: torch.Tensor, feature: int, count: int) -> torch.Tensor:
+        edges = torch.linspace(low[feature], high[feature], count + 1).double()
         # What lies outside of the range counts for the first or last interval.
-        return torch.bucketize(values.contiguous(), edges[1:-1])
+        return torch.bucketize(values[:, feature].double().contiguous(), edges[1:-1])
 
-    made = swaps.made[:, place.features[widest]].double()
-    return _Grid(place.labels[widest], edges, cells(recorded[:, widest]), cells(made))
+    first = widest[0]
+    if not place.is_point or not high[widest[1]] > low[widest[1]]:
+        edges = torch.linspace(low[first], high[first], CELLS + 1).double()
+        before, after = (divided(values, first, CELLS) for values in (recorded, made))
+        return Cells(name, (place.labels[first],), edges, before, after)
+
+    def planar(values: torch.Tensor) -> torch.Tensor:
+        row, column = (divided(values, feature, PLANE) for feature in widest[:2])
+        # Back and forth, so that successive cells are neighbours.
+        return row * PLANE + torch.where(row % 2 == 0, column, PLANE - 1 - column)
+
+    labels = tuple(place.labels[feature] for feature in widest[:2])
+    return Cells(name, labels, None, planar(recorded), planar(made))
 
 
 def moved_entities(

@@ -101,8 +101,10 @@ def write_report(
         ...     "next": {"observation": walk[1:], "done": step[:, None] % 50 == 49}},
         ...     [100])
         >>> scored = ScoredDataset(
-        ...     Path("walk"), data, EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"]),
-        ...     estimator="motion", settings={}, thresholds={"cup": 0.5},
+        ...     Path("walk"), data,
+        ...     EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"]),
+        ...     estimator="motion",
+        ...     settings={}, thresholds={"cup": 0.5},
         ...     confidence={"cup": "unclear"}, reasons={"cup": "random scores"},
         ...     free={"cup": 0.5})
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -128,7 +130,9 @@ def write_report(
             "most 1"
         )
     if file.is_dir():
-        raise FileExistsError(f"{file} is a folder: name a file in it, such as report.html")
+        raise FileExistsError(
+            f"{file} is a folder: name a file in it, such as report.html"
+        )
     if file.exists() and not overwrite:
         raise FileExistsError(f"{file} exists: pass overwrite=True to replace it")
     _check_packages()
