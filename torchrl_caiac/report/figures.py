@@ -212,7 +212,13 @@ def draw_coverage(pair: PairCoverage, *, name: str, description: str) -> str:
             for j in range(cells.shape[1]):
                 bars = [(x[a], x[b] - x[a]) for a, b in true_ranges(cells[:, j])]
                 if bars:
-                    axes.broken_barh(bars, (y[j], y[j + 1] - y[j]), facecolor=colour)
+                    axes.broken_barh(
+                        bars,
+                        (y[j], y[j + 1] - y[j]),
+                        facecolor=colour,
+                        edgecolor=colour,  # no seams between the rows
+                        linewidth=0.4,
+                    )
         axes.set_xlim(x[0], x[-1])
         axes.set_ylim(y[0], y[-1])
         axes.locator_params(nbins=5)
@@ -285,10 +291,10 @@ def draw_plan(
             axes.annotate(
                 short_label(entity, 16),
                 after,
-                # Above and below in turn, as two entities may be close.
-                xytext=(0, -17 if number % 2 else 9),
+                # On three sides in turn, as entities may be close.
+                xytext=((0, 9), (0, -17), (10, -3))[number % 3],
                 textcoords="offset points",
-                ha="center",
+                ha="left" if number % 3 == 2 else "center",
                 fontsize=9,
                 zorder=6,
             )

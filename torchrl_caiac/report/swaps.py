@@ -102,10 +102,9 @@ def sample_swaps(
     """
     keys = [*layout.in_keys, *map(layout.next, layout.in_keys), score_key]
     generator = torch.Generator().manual_seed(seed)
-    limits = set(thresholds.values())
     transform = CAIACTransform(
         layout,
-        limits.pop() if len(limits) == 1 else thresholds,
+        dict(thresholds),
         ratio,
         score_key=score_key,
         generator=generator,
@@ -137,9 +136,9 @@ def sample_swaps(
 class Cells:
     """The places of an entity, divided into cells.
 
-    An entity at a point in space has :data:`PLANE` by :data:`PLANE` cells, of the two
-    coordinates that vary most. Any other one has :data:`CELLS` intervals of the
-    position that varies most.
+    An entity at a point in space has :data:`PLANE` by :data:`PLANE` cells of its first
+    two coordinates, as seen from above. Any other one, and one that moves along a line,
+    has :data:`CELLS` intervals of the position that varies most.
 
     Attributes:
         name (str): the entity.
@@ -255,28 +254,27 @@ def _cells(swaps: SampledSwaps, name: str, place: Place) -> Cells | None:
     least = 2 * _NOISE * torch.tensor(place.floors, dtype=torch.float64)
     if not (high - low > least).any():
         low, high = ordered[0], ordered[-1]  # it may move in outliers alone
-        if not (high - low > least).any():
-            return None
-    widest = (high - low).argsort(descending=True, stable=True).tolist()
+    moves = high - low > least
+    if not moves.any():
+        return None
 
     def divided(values: torch.Tensor, feature: int, count: int) -> torch.Tensor:
         edges = torch.linspace(low[feature], high[feature], count + 1).double()
         # What lies outside of the range counts for the first or last interval.
         return torch.bucketize(values[:, feature].double().contiguous(), edges[1:-1])
 
-    first = widest[0]
-    if not place.is_point or not high[widest[1]] > low[widest[1]]:
-        edges = torch.linspace(low[first], high[first], CELLS + 1).double()
-        before, after = (divided(values, first, CELLS) for values in (recorded, made))
-        return Cells(name, (place.labels[first],), edges, before, after)
+    if not place.is_point or not moves[:2].all():
+        widest = int((high - low).argmax())
+        edges = torch.linspace(low[widest], high[widest], CELLS + 1).double()
+        before, after = (divided(values, widest, CELLS) for values in (recorded, made))
+        return Cells(name, (place.labels[widest],), edges, before, after)
 
     def planar(values: torch.Tensor) -> torch.Tensor:
-        row, column = (divided(values, feature, PLANE) for feature in widest[:2])
+        row, column = (divided(values, feature, PLANE) for feature in (0, 1))
         # Back and forth, so that successive cells are neighbours.
         return row * PLANE + torch.where(row % 2 == 0, column, PLANE - 1 - column)
 
-    labels = tuple(place.labels[feature] for feature in widest[:2])
-    return Cells(name, labels, None, planar(recorded), planar(made))
+    return Cells(name, place.labels[:2], None, planar(recorded), planar(made))
 
 
 def moved_entities(
