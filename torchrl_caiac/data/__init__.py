@@ -7,7 +7,11 @@ from torchrl_caiac.data.action_bounds import action_bounds
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
 from torchrl_caiac.data.digests import verify_digests, write_digests
 from torchrl_caiac.data.episodes import episode_transitions
+from torchrl_caiac.data.from_arrays import from_arrays
+from torchrl_caiac.data.from_stream import from_stream
 from torchrl_caiac.data.load_minari import load_minari
+from torchrl_caiac.data.load_ogbench import load_ogbench
+from torchrl_caiac.data.load_robomimic import load_robomimic
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
@@ -20,8 +24,12 @@ __all__ = [
     "action_bounds",
     "collect_episodes",
     "episode_transitions",
+    "from_arrays",
+    "from_stream",
     "load_episode",
     "load_minari",
+    "load_ogbench",
+    "load_robomimic",
     "load_transitions",
     "mix_trajectories",
     "offline_buffer",

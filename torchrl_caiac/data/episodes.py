@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
 
+from torchrl_caiac.data.array_trees import cut, to_numpy
+
 __all__ = ["episode_transitions"]
 
 # The names that entries of an observation must not have.
@@ -43,7 +45,8 @@ def episode_transitions(
     environments, its entries become entries of the root, such as ``"achieved_goal"``
     and ``"desired_goal"``. Any other mapping becomes a nested ``"observation"``.
 
-    Floating-point numbers become float32, integers and booleans stay. The arrays are
+    Floating-point numbers become float32, integers and booleans stay (unsigned integers
+    of more than one byte become signed, with the same values). The arrays are
     NumPy arrays, tensors, or what ``numpy.asarray`` converts to numbers, such as the
     arrays of an HDF5 file. They are copied.
 
@@ -131,12 +134,16 @@ def episode_transitions(
     if info:
         kept = reader.arrays(info, ("info",))
         reader.check_lengths(kept, (length, length + 1), above=("info",))
-        kept = _cut(kept, slice(0, length))
+        kept = cut(kept, slice(0, length))
         td["info"] = reader.tensors(kept, ("info",), cast=False)
     return td
 
 
 _NEXT = ", one state more than actions (or give next_observations)"
+
+
+# torch cannot subtract unsigned integers of more than one byte, or write to some rows.
+_WIDER = {2: np.int32, 4: np.int64, 8: np.int64}
 
 
 class _Reader:
@@ -193,14 +200,7 @@ class _Reader:
             raise ValueError(
                 f"{key!r} in {self.where} has masked values: {self.remove}"
             )
-        if isinstance(value, torch.Tensor):
-            value = value.detach().cpu().as_subclass(torch.Tensor)
-            # NumPy has no bfloat16.
-            value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
-        try:
-            array = np.asarray(value)
-        except ValueError:  # lists of different lengths
-            array = np.empty(0, object)
+        array = to_numpy(value)
         if array.dtype.kind not in "biuf" or array.dtype == np.longdouble:
             kind = {"O": "Python objects", "S": "bytes", "U": "text"}
             raise ValueError(
@@ -295,7 +295,15 @@ class _Reader:
                 continue
             # Copied, because a library may return read-only arrays, in this machine's
             # byte order, because torch has no other one.
-            array = np.array(value, value.dtype.newbyteorder("="))
+            dtype = (
+                _WIDER.get(value.dtype.itemsize) if value.dtype.kind == "u" else None
+            )
+            array = np.array(value, dtype or value.dtype.newbyteorder("="))
+            if value.dtype.itemsize == 8 and dtype and (array < 0).any():
+                raise ValueError(
+                    f"{_key(key)!r} in {self.where} has numbers above 2**63, which no "
+                    f"tensor can hold: {self.leave_out(_key(key))}"
+                )
             if np.issubdtype(array.dtype, np.floating):
                 with np.errstate(over="ignore"):
                     array = array.astype(np.float32, copy=False) if cast else array
@@ -317,13 +325,6 @@ def _length(value: Any) -> int:
     while isinstance(value, dict):
         value = next(iter(value.values()))
     return len(value) if value.ndim else -1
-
-
-def _cut(tree: Mapping[str, Any], rows: slice) -> dict[str, Any]:
-    return {
-        key: _cut(value, rows) if isinstance(value, dict) else value[rows]
-        for key, value in tree.items()
-    }
 
 
 def _shape(value: Any) -> Any:
