@@ -443,9 +443,11 @@ def test_arguments(tmp_path):
     for none in ([], (), np.array([], int)):
         with pytest.raises(ValueError, match=r"columns is empty.*leave out columns="):
             load_minari(dataset, tmp_path / "rows", columns=none, progress=False)
-    load_minari(dataset, tmp_path / "rows", progress=False)
-    with pytest.raises(FileExistsError, match="overwrite=True"):
-        load_minari(dataset, tmp_path / "rows", progress=False)
+    first = load_minari(dataset, tmp_path / "rows", progress=False)
+    again = load_minari(dataset, tmp_path / "rows", progress=False)
+    assert (first == again).all()
+    with pytest.raises(FileExistsError, match=r"arguments differ.*overwrite=True"):
+        load_minari(dataset, tmp_path / "rows", columns=[0], progress=False)
     again = load_minari(dataset, tmp_path / "rows", overwrite=True, progress=False)
     assert len(again) == sum(LENGTHS)
     with pytest.raises(FileNotFoundError, match="absent-v0"):

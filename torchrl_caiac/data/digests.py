@@ -23,6 +23,7 @@ __all__ = [
     "data_source",
     "file_digest",
     "has_digests",
+    "original_leaves",
     "verify_digests",
     "write_digests",
 ]
@@ -83,17 +84,43 @@ def content_digests(rows: TensorDictBase, *added: NestedKey | None) -> dict[str,
         >>> list(content_digests(rows))
         ['next.done']
     """
+    leaves = original_leaves(rows, *added)
+    return {".".join(key): _tensor_digest(leaf) for key, leaf in leaves.items()}
+
+
+def original_leaves(
+    rows: TensorDictBase, *added: NestedKey | None
+) -> dict[tuple[str, ...], torch.Tensor]:
+    """Returns the leaves of transitions without those that were added later.
+
+    Args:
+        rows (TensorDictBase): the transitions, ``[T]``.
+        *added (NestedKey, optional): as for :func:`content_digests`.
+
+    Returns:
+        dict of tuple to torch.Tensor: the leaves that were written together, and those
+        of ``added`` that are there, by the parts of their keys. All leaves, if the
+        transitions have no folder with a ``digests.json``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.digests import original_leaves
+        >>> rows = TensorDict({"next": {"done": torch.ones(3, 1)}}, [3])
+        >>> list(original_leaves(rows))
+        [('next', 'done')]
+    """
     leaves = {path_of(key): leaf for key, leaf in rows.items(True, True)}
     folder = memmap_folder(rows)
-    if folder is not None and has_digests(folder):
-        names = set(_read(Path(folder))["sha256"])
-        kept = {path_of(key) for key in added if key is not None}
-        leaves = {
-            key: leaf
-            for key, leaf in leaves.items()
-            if key in kept or _name(folder, leaf) in names
-        }
-    return {".".join(key): _tensor_digest(leaf) for key, leaf in leaves.items()}
+    if folder is None or not has_digests(folder):
+        return leaves
+    names = set(_read(Path(folder))["sha256"])
+    kept = {path_of(key) for key in added if key is not None}
+    return {
+        key: leaf
+        for key, leaf in leaves.items()
+        if key in kept or _name(folder, leaf) in names
+    }
 
 
 def _name(folder: str, leaf: torch.Tensor) -> str | None:

@@ -43,7 +43,8 @@ def episode_transitions(
     environments, its entries become entries of the root, such as ``"achieved_goal"``
     and ``"desired_goal"``. Any other mapping becomes a nested ``"observation"``.
 
-    Floating-point numbers become float32, integers and booleans stay. The arrays are
+    Floating-point numbers become float32, integers and booleans stay (unsigned integers
+    of more than one byte become signed, with the same values). The arrays are
     NumPy arrays, tensors, or what ``numpy.asarray`` converts to numbers, such as the
     arrays of an HDF5 file. They are copied.
 
@@ -137,6 +138,10 @@ def episode_transitions(
 
 
 _NEXT = ", one state more than actions (or give next_observations)"
+
+
+# torch cannot subtract unsigned integers of more than one byte, or write to some rows.
+_WIDER = {2: np.int32, 4: np.int64, 8: np.int64}
 
 
 class _Reader:
@@ -295,7 +300,15 @@ class _Reader:
                 continue
             # Copied, because a library may return read-only arrays, in this machine's
             # byte order, because torch has no other one.
-            array = np.array(value, value.dtype.newbyteorder("="))
+            dtype = (
+                _WIDER.get(value.dtype.itemsize) if value.dtype.kind == "u" else None
+            )
+            array = np.array(value, dtype or value.dtype.newbyteorder("="))
+            if value.dtype.itemsize == 8 and dtype and (array < 0).any():
+                raise ValueError(
+                    f"{_key(key)!r} in {self.where} has numbers above 2**63, which no "
+                    f"tensor can hold: {self.leave_out(_key(key))}"
+                )
             if np.issubdtype(array.dtype, np.floating):
                 with np.errstate(over="ignore"):
                     array = array.astype(np.float32, copy=False) if cast else array

@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
-from tqdm.auto import tqdm
 
 from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._keys import path as path_of
-from torchrl_caiac.data.digests import data_source, file_digest, has_digests
+from torchrl_caiac.data.digests import file_digest
 from torchrl_caiac.data.episodes import episode_transitions
-from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.minari_checks import episode_lengths
 from torchrl_caiac.data.minari_files import open_minari
-from torchrl_caiac.data.transition_writer import TransitionWriter
-from torchrl_caiac.data.write_transitions import check_free
+from torchrl_caiac.data.write_episodes import Part, write_episodes
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.dataset.episode_data import EpisodeData
 
 __all__ = ["load_minari"]
-
-_logger = logging.getLogger("torchrl_caiac.data.load_minari")
 
 _REMOVE = "remove the episode with MinariDataset.filter_episodes"
 
@@ -58,7 +52,8 @@ def load_minari(
 
     The folder also has the bounds of the action space (see
     :func:`~torchrl_caiac.data.action_bounds`) where they are finite, and the digests of
-    its leaves and of the dataset's files.
+    its leaves and of the dataset's files. A second call with the same dataset and
+    arguments opens the folder.
 
     Args:
         dataset (str or MinariDataset): the dataset or its id.
@@ -84,7 +79,8 @@ def load_minari(
         TensorDict: the memory-mapped transitions, ``[T]``.
 
     Raises:
-        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        FileExistsError: ``path`` exists, was not written by an equal call, and
+            ``overwrite`` is ``False``.
         FileNotFoundError: the dataset is not on this machine.
         KeyError: an episode lacks one of ``infos`` or ``exclude``.
         OSError: the disk is full.
@@ -123,7 +119,6 @@ def load_minari(
         torch.Size([10, 3])
         >>> folder.cleanup()
     """
-    check_free(path, overwrite)
     if columns is not None and not len(columns):
         raise ValueError(
             "columns is empty, expected at least one column of the observation: leave "
@@ -138,39 +133,27 @@ def load_minari(
 
     left_out = {path_of(as_key(key)) for key in exclude}
     source = _source(dataset)
-    _warn_of_other_source(path, source)
+    arguments = {
+        "columns": None if columns is None else [int(column) for column in columns],
+        "infos": list(infos),
+        "exclude": sorted(map(list, left_out)),
+    }
+    if any(arguments.values()):
+        source["arguments"] = arguments
     space = dataset.action_space
     is_box = isinstance(space, gymnasium.spaces.Box)
     is_bounded = is_box and space.shape and space.is_bounded()
-    with TransitionWriter(
+    return write_episodes(
+        _parts(dataset, lengths, columns, infos, left_out),
         path,
-        overwrite=overwrite,
-        action_bounds=(space.low, space.high) if is_bounded else None,
         source=source,
+        action_bounds=(space.low, space.high) if is_bounded else None,
+        overwrite=overwrite,
+        progress=progress,
         rows=sum(lengths),
-    ) as writer:
-        _fill(dataset, lengths, writer, columns, infos, left_out, progress)
-    return load_transitions(path)
-
-
-def _warn_of_other_source(path: str | Path, source: Mapping[str, Any]) -> None:
-    if not has_digests(path):
-        return
-    try:
-        same = data_source(path) == source
-    except UnreadableFileError as error:
-        _logger.warning(
-            "it cannot be known what %s was written from (%s): it is replaced",
-            path,
-            error,
-        )
-        return
-    if not same:
-        _logger.warning(
-            "%s was written from other data than %s has now: it is replaced",
-            path,
-            source["dataset"],
-        )
+        total=len(lengths),
+        description=f"loading {dataset.id}",
+    )
 
 
 def _source(dataset: MinariDataset) -> dict[str, Any]:
@@ -200,27 +183,17 @@ def _episodes(dataset: MinariDataset) -> Iterator[EpisodeData]:
         yield episode
 
 
-def _fill(
+def _parts(
     dataset: MinariDataset,
     lengths: Sequence[int],
-    writer: TransitionWriter,
     columns: Sequence[int] | None,
     infos: Sequence[str],
     left_out: set[tuple[str, ...]],
-    progress: bool,
-) -> None:
-    bar = tqdm(
-        zip(_episodes(dataset), lengths, strict=True),
-        total=len(lengths),
-        desc=f"loading {dataset.id}",
-        unit="episode",
-        disable=not progress,
-    )
-    for episode, length in bar:
+) -> Iterator[Part]:
+    for episode, length in zip(_episodes(dataset), lengths, strict=True):
         where = f"episode {episode.id} of {dataset.id}"
-        writer.add(
-            _transitions(episode, length, columns, infos, left_out, where), where=where
-        )
+        rows = _transitions(episode, length, columns, infos, left_out, where)
+        yield Part(rows, where)
 
 
 def _transitions(

@@ -13,7 +13,12 @@ from torchrl_caiac._files import UnreadableFileError, read_json
 if TYPE_CHECKING:
     from minari import MinariDataset
 
-__all__ = ["check_hdf5_array", "check_metadata", "episode_lengths"]
+__all__ = [
+    "check_hdf5_array",
+    "check_hdf5_group",
+    "check_metadata",
+    "episode_lengths",
+]
 
 _MAIN_FILE = "main_data.hdf5"
 _AGAIN = "download or collect the dataset again"
@@ -159,7 +164,7 @@ def episode_lengths(dataset: MinariDataset) -> list[int]:
         with h5py.File(file, "r") as stored:
             for index, episode in zip(dataset.episode_indices, metadata, strict=True):
                 group = stored[f"episode_{index}"]
-                _check_group(group, file)
+                check_hdf5_group(group, file)
                 length, said = len(group["rewards"]), episode["total_steps"]
                 if said != length:
                     raise ValueError(
@@ -176,7 +181,27 @@ def episode_lengths(dataset: MinariDataset) -> list[int]:
     return lengths
 
 
-def _check_group(group: Any, file: Path) -> None:
+def check_hdf5_group(group: Any, file: Path) -> None:
+    """Raises if an array in an HDF5 group, or in the groups below, is not whole.
+
+    Args:
+        group (h5py.Group): the group.
+        file (Path): the file.
+
+    Raises:
+        UnreadableFileError: see :func:`check_hdf5_array`.
+        ValueError: an entry is a link.
+
+    Examples:
+        >>> import tempfile, h5py
+        >>> from pathlib import Path
+        >>> from torchrl_caiac.data.minari_checks import check_hdf5_group
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(f"{folder}/a.hdf5")
+        ...     with h5py.File(path, "w") as stored:
+        ...         stored["a/b"] = [1.0, 2.0]
+        ...         check_hdf5_group(stored, path)
+    """
     import h5py
 
     for name in group:
@@ -185,7 +210,7 @@ def _check_group(group: Any, file: Path) -> None:
             raise ValueError(f"{where} is a link, perhaps into another file")
         item = group[name]
         if isinstance(item, h5py.Group):
-            _check_group(item, file)
+            check_hdf5_group(item, file)
         else:
             check_hdf5_array(item, file)
 
