@@ -42,7 +42,8 @@ LAYERS = [
     {"transforms"},
     {"evaluation"},
     {"_figures", "plotting"},
-    {"scored"},
+    {"augment", "inspection", "report", "scored"},
+    {"__main__", "cli"},
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -27,7 +27,13 @@ from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 from torchrl_caiac.scored import MODEL_FOLDER
 
-__all__ = ["ESTIMATORS", "Context", "EstimatorEntry", "add_options", "estimator_settings"]
+__all__ = [
+    "ESTIMATORS",
+    "Context",
+    "EstimatorEntry",
+    "add_options",
+    "estimator_settings",
+]
 
 _CHECKPOINT, _MODEL, _CONFIG = "checkpoint.zip", "model.zip", "model.json"
 _AGAIN = "fit it again, with `caiac score`"
@@ -334,7 +340,9 @@ def _load(source: Path, context: Context) -> EntityDynamicsModel:
             "`caiac score --estimator cai` (or attention) has ended"
         )
     config = read_json(file, "description of a world model", _AGAIN)
-    kinds = {kind.__name__: kind for kind in (GaussianWorldModel, TransformerWorldModel)}
+    kinds = {
+        kind.__name__: kind for kind in (GaussianWorldModel, TransformerWorldModel)
+    }
     try:
         model: EntityDynamicsModel = kinds[config["class"]].from_config(config)
     except (KeyError, TypeError, ValueError) as error:

@@ -104,9 +104,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is a file: give a folder")
     with claim_folder(folder):
-        data = convert(
-            args.data, folder, described, console, overwrite=args.overwrite
-        )
+        data = convert(args.data, folder, described, console, overwrite=args.overwrite)
         replace = _settle(args, layout, settings, folder)
         context = Context(
             layout,
@@ -211,9 +209,7 @@ def _score(
     )
 
 
-def _write_scores(
-    rb: Any, estimator: Any, context: Context, *, replace: bool
-) -> None:
+def _write_scores(rb: Any, estimator: Any, context: Context, *, replace: bool) -> None:
     arguments: dict[str, Any] = {
         "smoothing": context.settings["smoothing"],
         "lookahead": context.settings["lookahead"],
@@ -232,9 +228,13 @@ def _write_scores(
 
 class _Suggestions:  # TODO
     def __init__(self, layout):
-        names=[n for n in layout.names if n not in layout.fixed]
-        self.thresholds=dict.fromkeys(names,.05); self.confidence=dict.fromkeys(names,"unclear")
-        self.reasons=dict.fromkeys(names,"x"); self.free=dict.fromkeys(names,.5)
+        names = [n for n in layout.names if n not in layout.fixed]
+        self.thresholds = dict.fromkeys(names, 0.05)
+        self.confidence = dict.fromkeys(names, "unclear")
+        self.reasons = dict.fromkeys(names, "x")
+        self.free = dict.fromkeys(names, 0.5)
+
+
 def suggest_thresholds(rb, layout):
     return _Suggestions(layout)
 

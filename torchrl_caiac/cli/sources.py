@@ -362,11 +362,12 @@ def _convert(
             rows.exclude("caiac"), data, action_bounds=action_bounds(rows)
         )
         return
-    from torchrl_caiac.data import load_minari
+    from torchrl_caiac.data import open_dataset
 
-    load_minari(
-        source.removeprefix("minari://"),
+    open_dataset(
+        source,
         data,
+        format=described["format"],
         progress=console.progress,
         **described["options"],
     )

@@ -271,7 +271,9 @@ class CounterfactualTransform(RandomTransform, ABC):
         """Restores what :meth:`get_extra_state` returned."""
         super().set_extra_state(state)
         if self.threshold == "auto" and "thresholds" in state:
-            names = [name for name in self.layout.names if name not in self.layout.fixed]
+            names = [
+                name for name in self.layout.names if name not in self.layout.fixed
+            ]
             numbers = state["thresholds"].tolist()
             if len(numbers) != len(names):
                 raise ValueError(
