@@ -15,6 +15,7 @@ LAYERS = [
     {
         "_buffer_transform",
         "_columns",
+        "_figures",
         "_files",
         "_fingerprints",
         "_keys",
@@ -41,9 +42,13 @@ LAYERS = [
     {"influence"},
     {"transforms"},
     {"evaluation"},
+<<<<<<< HEAD
     {"_figures", "plotting"},
     {"augment", "inspection", "report", "scored"},
     {"__main__", "cli"},
+=======
+    {"plotting"},
+>>>>>>> thresholds
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))

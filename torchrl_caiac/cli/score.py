@@ -31,7 +31,7 @@ from torchrl_caiac.cli.sources import (
 )
 from torchrl_caiac.data import action_bounds, offline_buffer
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence import score_buffer
+from torchrl_caiac.influence import score_buffer, suggest_thresholds
 from torchrl_caiac.scored import ScoredDataset, write_scored
 
 __all__ = ["add_parser", "run"]
@@ -224,19 +224,6 @@ def _write_scores(rb: Any, estimator: Any, context: Context, *, replace: bool) -
         if not replace:
             raise
         score_buffer(rb, estimator, overwrite=True, **arguments)
-
-
-class _Suggestions:  # TODO
-    def __init__(self, layout):
-        names = [n for n in layout.names if n not in layout.fixed]
-        self.thresholds = dict.fromkeys(names, 0.05)
-        self.confidence = dict.fromkeys(names, "unclear")
-        self.reasons = dict.fromkeys(names, "x")
-        self.free = dict.fromkeys(names, 0.5)
-
-
-def suggest_thresholds(rb, layout):
-    return _Suggestions(layout)
 
 
 def _coverage(

@@ -16,6 +16,10 @@ from torchrl_caiac.influence.motion import MotionInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
+from torchrl_caiac.influence.thresholds import (
+    ThresholdSuggestions,
+    suggest_thresholds,
+)
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,
     TrueInfluence,
@@ -31,6 +35,7 @@ __all__ = [
     "MotionInfluence",
     "ScoreOnWrite",
     "SimulatorInfluence",
+    "ThresholdSuggestions",
     "TrueInfluence",
     "best_threshold",
     "causal_action_influence",
@@ -39,5 +44,6 @@ __all__ = [
     "roc_auc",
     "score_buffer",
     "score_file",
+    "suggest_thresholds",
     "true_influence",
 ]

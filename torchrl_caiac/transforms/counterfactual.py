@@ -271,17 +271,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         """Restores what :meth:`get_extra_state` returned."""
         super().set_extra_state(state)
         if self.threshold == "auto" and "thresholds" in state:
-            names = [
-                name for name in self.layout.names if name not in self.layout.fixed
-            ]
-            numbers = state["thresholds"].tolist()
-            if len(numbers) != len(names):
-                raise ValueError(
-                    f"the state has {len(numbers)} thresholds, the layout has "
-                    f"{len(names)} entities that are not fixed, {names}: it is of "
-                    "another layout"
-                )
-            self._thresholds.choose(dict(zip(names, numbers, strict=True)))
+            self._thresholds.restore(state["thresholds"])
             self.refresh_donors()  # whose index depends on them
 
     # --- the two halves of an augmentation -------------------------------------------

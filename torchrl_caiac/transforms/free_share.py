@@ -97,9 +97,9 @@ class FreeShare:
         found = []
         if never:
             found.append(
-                f"{never} in none of the first {self._windows} windows: of them nothing "
-                "is ever swapped, so the threshold is too low, their scores are too "
-                "high, or rows are not scored"
+                f"{never} in none of the first {self._windows} windows: nothing of "
+                "them is ever swapped, so the threshold is too low, their scores are "
+                "too high, or rows are not scored"
             )
         if always:
             found.append(

@@ -103,6 +103,24 @@ class EntityThresholds:
         """
         self._set(_checked(self.layout, numbers))
 
+    def restore(self, numbers: torch.Tensor) -> None:
+        """Sets the numbers of ``"auto"`` to those of another transform.
+
+        Args:
+            numbers (torch.Tensor): float64, one for each entity that is not fixed.
+
+        Raises:
+            ValueError: there are not as many entities.
+        """
+        names = _free_names(self.layout)
+        if numbers.numel() != len(names):
+            raise ValueError(
+                f"the state has {numbers.numel()} thresholds, the layout has "
+                f"{len(names)} entities that are not fixed, {names}: it is of another "
+                "layout"
+            )
+        self.choose(dict(zip(names, numbers.tolist(), strict=True)))
+
     def choose_from(self, buffer: ReplayBuffer | None, score_key: NestedKey) -> None:
         """Chooses the numbers of ``"auto"`` from the scores of a buffer.
 
@@ -114,12 +132,12 @@ class EntityThresholds:
             RuntimeError: there is no buffer, or none with a storage of its own.
         """
         if buffer is None or not isinstance(buffer.storage, TensorStorage):
-            found = "no replay buffer samples here"
+            what = "no replay buffer samples here"
             if buffer is not None:
-                found = f"the buffer has a {type(buffer.storage).__name__}"
+                what = f"the buffer has a {type(buffer.storage).__name__}"
             raise RuntimeError(
                 "threshold='auto' reads the scores of the replay buffer that samples, "
-                f"but {found}: pass numbers, such as "
+                f"but {what}: pass numbers, such as "
                 "threshold=suggest_thresholds(rb, layout).thresholds"
             )
         with _CHOOSING:  # batches may be prefetched by several threads
