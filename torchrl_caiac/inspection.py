@@ -343,7 +343,9 @@ class _Columns:
         span = torch.nan_to_num(self.high - self.low, 0.0, 0.0, 0.0)
         size = change.abs()
         # What is far smaller than everything else is jitter, not motion.
-        usual = span[span > 0].median() if bool((span > 0).any()) else span.new_zeros(())
+        usual = (
+            span[span > 0].median() if bool((span > 0).any()) else span.new_zeros(())
+        )
         self.moving = (size > _MOVES * span) & (span > _JITTER * usual)
         self.moves = self.moving.double().mean(0)
         large = torch.where(self.moving, size, torch.nan)

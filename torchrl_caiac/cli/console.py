@@ -61,6 +61,11 @@ class Console:
         """Whether progress bars are shown."""
         return self._is_terminal
 
+    @property
+    def streams(self) -> tuple[TextIO, TextIO]:
+        """The standard output and error, for another process that writes to them."""
+        return self._out, self._err
+
     def __enter__(self) -> Console:
         """Takes over the standard output and error, log messages and warnings."""
         with ExitStack() as stack:

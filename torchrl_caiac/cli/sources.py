@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +23,27 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.scored import DATA_FOLDER, LAYOUT_FILE, MODEL_FOLDER, SCORES_FILE
 
 __all__ = [
+    "SETTINGS_FILE",
     "SOURCE_FILE",
     "add_data",
     "add_layout",
     "convert",
     "describe_source",
+    "loader_options",
     "open_data",
+    "open_named",
     "read_layout",
+    "remove_scores",
 ]
 
-#: What the transitions in a folder were made from, beside them.
-SOURCE_FILE = "source.json"
+#: What the transitions in a folder were made from, beside them; and how their scores
+#: are computed, from the start of scoring on.
+SOURCE_FILE, SETTINGS_FILE = "source.json", "settings.json"
 
 _META = "meta.json"
 _REMOTE = ("minari", "ogbench", "lerobot")
 _VIDEOS = {".mp4", ".png", ".jpg", ".jpeg", ".avi", ".webm", ".mkv"}
-_OWN = (DATA_FOLDER, LAYOUT_FILE, MODEL_FOLDER, SCORES_FILE, SOURCE_FILE)
+_OF_SCORES = (SCORES_FILE, LAYOUT_FILE, MODEL_FOLDER)
 _DATA_HELP = (
     "the dataset: a folder of transitions, an .npz or .hdf5 file, the folder of a "
     "LeRobot dataset, a Minari id, minari://ID, ogbench://NAME, lerobot://REPO, or a "
@@ -125,7 +130,7 @@ def read_layout(name: str) -> EntityLayout:
     return ready_layout(name)
 
 
-def _options(texts: list[str]) -> dict[str, Any]:
+def loader_options(texts: list[str]) -> dict[str, Any]:
     """Returns the options of a loader.
 
     Raises:
@@ -235,15 +240,38 @@ def open_data(args: argparse.Namespace, console: Console) -> TensorDict:
     Raises:
         UsageError: there is no such file, or the format is unknown.
     """
-    options = _options(args.option)
-    path = _local(args.data)
+    options = loader_options(args.option)
+    return open_named(args.data, args.cache, console, args.format, options)
+
+
+def open_named(
+    source: str,
+    cache: str | None,
+    console: Console,
+    format: str | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> TensorDict:
+    """Opens a source, as :func:`open_data` does.
+
+    Args:
+        source (str): such as the argument DATA.
+        cache (str, optional): the folder for converted data; ``None`` for the default.
+        console (Console): shows progress.
+        format (str, optional): its format. Defaults to ``None``.
+        options (mapping, optional): those of the loader. Defaults to ``None``.
+
+    Returns:
+        TensorDict: the memory-mapped transitions, ``[T]``.
+    """
+    path = _local(source)
     if path is not None and (path / _META).exists():
         return load_transitions(path)
-    described = describe_source(args.data, args.format, options)
+    described = describe_source(source, format, options)
     text = json.dumps(described, sort_keys=True)
-    root = Path(args.cache) if args.cache else _cache_root()
+    root = Path(cache) if cache else _cache_root()
     folder = root / hashlib.sha256(text.encode()).hexdigest()[:16]
-    return convert(args.data, folder, described, console)
+    with claim_folder(folder):
+        return convert(source, folder, described, console)
 
 
 def _cache_root() -> Path:
@@ -292,7 +320,7 @@ def convert(
                 "another folder, or pass --overwrite to replace them"
             )
         if before != described:
-            clear(folder)
+            _remove(folder, (*_OF_SCORES, SETTINGS_FILE, DATA_FOLDER, SOURCE_FILE))
     if not data.is_dir():
         write_json(file, described)
         with console.step(f"reading {source}"):
@@ -300,9 +328,13 @@ def convert(
     return load_transitions(data)
 
 
-def clear(folder: Path) -> None:
-    """Removes what earlier calls wrote to a folder, and nothing else."""
-    for name in (*reversed(_OWN),):
+def remove_scores(folder: Path) -> None:
+    """Removes what depends on scores from a folder; the transitions stay."""
+    _remove(folder, _OF_SCORES)
+
+
+def _remove(folder: Path, names: Iterable[str]) -> None:
+    for name in names:
         path = folder / name
         if path.is_dir():
             shutil.rmtree(path)
@@ -330,11 +362,12 @@ def _convert(
             rows.exclude("caiac"), data, action_bounds=action_bounds(rows)
         )
         return
-    from torchrl_caiac.data import load_minari
+    from torchrl_caiac.data import open_dataset
 
-    load_minari(
-        source.removeprefix("minari://"),
+    open_dataset(
+        source,
         data,
+        format=described["format"],
         progress=console.progress,
         **described["options"],
     )
