@@ -37,7 +37,6 @@ from torchrl_caiac.scored import ScoredDataset
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 
 __all__ = [
-    "NEVER_INFLUENCED",
     "Entity",
     "Panel",
     "Problem",
@@ -47,8 +46,9 @@ __all__ = [
 ]
 
 _logger = logging.getLogger("torchrl_caiac.report")
-#: What ``suggest_thresholds`` says of an entity that nothing influences.
+# What ``suggest_thresholds`` says of thresholds.
 NEVER_INFLUENCED = "one mode: never influenced"
+UNCLEAR = "unclear"
 _CHECKED_ROWS = 50_000
 _MOST_STRIPS = 12  # entities along one trajectory
 _MOST_SCORES = 200_000  # scores in one histogram
@@ -367,27 +367,31 @@ def _findings(check: DatasetReport) -> list[Problem]:
 
 def _threshold_problems(entities: Sequence[Entity]) -> list[Problem]:
     swappable = [entity for entity in entities if not entity.fixed]
-    found = [
-        Problem(
-            "warning",
-            f"The threshold of {entity.name} is unclear: {entity.reason}",
-            "it may be swapped while the agent moves it, or never",
-            "look at its scores below, and choose a threshold by hand",
-        )
-        for entity in swappable
-        if entity.confidence == "unclear"
-    ]
-    never = [e.name for e in swappable if e.shares.rows == 0]
-    if never:
+    found = []
+    for entity in swappable:
+        if entity.confidence != UNCLEAR:
+            continue
         found.append(
             Problem(
                 "warning",
-                f"Never swapped would be {', '.join(never)}: the score is above the "
-                "threshold in every transition",
-                "no counterfactual changes them",
-                "check that they ever rest; if so, the threshold is too low",
+                f"No clear threshold was found for {entity.name}: {entity.reason}",
+                "it is never swapped"
+                if entity.shares.rows == 0
+                else "it may be swapped while the agent moves it",
+                "look at its scores below, and choose a threshold by hand",
             )
         )
+    never = [e for e in swappable if e.shares.rows == 0 and e.confidence != UNCLEAR]
+    found += [
+        Problem(
+            "warning",
+            f"{e.name} is never swapped: its score is above the threshold in every "
+            "transition",
+            "no counterfactual changes it",
+            "check that it ever rests; if so, the threshold is too low",
+        )
+        for e in never
+    ]
     always = [e for e in swappable if e.shares.rows == 1]
     expected = [e.name for e in always if e.confidence == NEVER_INFLUENCED]
     if expected:

@@ -118,6 +118,7 @@ def draw_scores(
     values = scores.astype(np.float64)
     positive = values[values > 0]
     rest = int((values <= 0).sum())
+    free_rest = int((values <= min(threshold, 0)).sum())
     inside = [*positive, threshold] if threshold > 0 else positive
     low, high = (np.min(inside), np.max(inside)) if len(inside) else (0.1, 1.0)
     low, high = np.log10(low) - 0.1, np.log10(high) + 0.1
@@ -146,13 +147,11 @@ def draw_scores(
                 )
         left = edges[0] - 3.2 * width
         if rest:
-            axes.bar(
-                left,
-                rest,
-                2 * width,
-                align="edge",
-                color=RECORDED if threshold >= 0 else INFLUENCED,
-            )
+            parts = [(free_rest, RECORDED), (rest - free_rest, INFLUENCED)]
+            parts = [part for part in parts if part[0]]
+            for place, (count, colour) in enumerate(parts):
+                own = 2 * width / len(parts)
+                axes.bar(left + place * own, count, own, align="edge", color=colour)
         if threshold > 0:
             axes.axvline(
                 np.log10(threshold), color=INK, linewidth=1, linestyle=(0, (4, 3))

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.layouts import layout_names, ready_layout
 
 __all__ = ["RenderFn", "as_pictures", "known_renderer"]
 
@@ -20,15 +20,15 @@ __all__ = ["RenderFn", "as_pictures", "known_renderer"]
 RenderFn = Callable[[TensorDictBase], Any]
 _SIZE = (480, 360)
 _DIFFERENT = 24  # of 255, the change of a pixel that counts
-_MOST_CUBES = 8
 _QUALITY = 82
 
 
 def known_renderer(layout: EntityLayout) -> RenderFn | None:
     """Returns a function that renders the states of a layout.
 
-    Known are the layouts of :class:`~torchrl_caiac.envs.KitchenEnv` and
-    :class:`~torchrl_caiac.envs.FetchPushCubes`.
+    Known are the layouts of :class:`~torchrl_caiac.envs.KitchenEnv`, of
+    :class:`~torchrl_caiac.envs.FetchPushCubes` and of OGBench's manipulation
+    environments.
 
     Args:
         layout (EntityLayout): the entities.
@@ -46,61 +46,47 @@ def known_renderer(layout: EntityLayout) -> RenderFn | None:
         >>> known_renderer(EntityLayout({"arm": [0], "cup": [1]})) is None
         True
     """
-    columns = dict(layout.columns)
-    if not columns:
+    if not layout.is_flat:
         return None
-    if set(columns) == set(_KITCHEN):
-        from torchrl_caiac.envs import KitchenEnv
-
-        if columns == KitchenEnv.layout.columns:
-            return lambda states: _kitchen(states[_key(layout)])
-    cubes = len(columns) - 1
-    if "gripper" in columns and 1 <= cubes <= _MOST_CUBES and "cube0" in columns:
-        from torchrl_caiac.envs import fetch_push_layout
-
-        if columns == fetch_push_layout(cubes).columns:
-            return lambda states: _fetch_push(states[_key(layout)], cubes)
+    names = [
+        name for name in layout_names() if ready_layout(name).columns == layout.columns
+    ]
+    if "kitchen/positions" in names:
+        return lambda states: _kitchen(_observations(states, layout))
+    cubes = sum(name.startswith("cube") for name in layout.names)
+    for name in names:
+        if name.startswith("fetch_push_cubes/"):
+            return lambda states: _fetch_push(_observations(states, layout), cubes)
+        family, _, task = name.partition("/")
+        if family == "ogbench":
+            return lambda states: _ogbench(_observations(states, layout), layout, task)
     return None
 
 
-# Compared before the simulator is imported.
-_KITCHEN = (
-    "robot",
-    "bottom_right_burner",
-    "bottom_burner",
-    "top_right_burner",
-    "top_burner",
-    "light_switch",
-    "slide_cabinet",
-    "hinge_cabinet",
-    "microwave",
-    "kettle",
-)
+def _observations(states: TensorDictBase, layout: EntityLayout) -> NDArray[np.float64]:
+    return states[layout.in_keys[0]].double().numpy()
 
 
-def _key(layout: EntityLayout) -> Any:
-    return layout.in_keys[0]
-
-
-def _kitchen(states: torch.Tensor) -> NDArray[np.uint8]:
+def _kitchen(states: NDArray[np.float64]) -> NDArray[np.uint8]:
     from torchrl_caiac.envs import KitchenEnv
 
     env = KitchenEnv(render_mode="rgb_array", render_size=_SIZE)
     try:
-        return env.render_states(states.double().numpy())
+        return env.render_states(states)
     finally:
         env.close()
 
 
-def _fetch_push(states: torch.Tensor, cubes: int) -> NDArray[np.uint8]:
-    from gymnasium_robotics.utils.rotations import euler2quat
-
+def _fetch_push(states: NDArray[np.float64], cubes: int) -> NDArray[np.uint8]:
     from torchrl_caiac.envs import FetchPushCubes
     from torchrl_caiac.envs.fetch_push.simulator import FetchPushSimulator
 
+    # isort: split
+    from gymnasium_robotics.utils.rotations import euler2quat
+
     simulator = FetchPushSimulator(cubes)
     snapshots = []
-    for state in states.double().numpy():
+    for state in states:
         poses = state[10:].reshape(cubes, -1)
         simulator.start(poses[:, :3], state[:3])
         joints = simulator.data.qpos[-7 * cubes :].reshape(cubes, 7)
@@ -112,6 +98,67 @@ def _fetch_push(states: torch.Tensor, cubes: int) -> NDArray[np.uint8]:
         return env.render_states(np.stack(snapshots), np.tile([0, 0, -9.0], cubes))
     finally:
         env.close()
+
+
+# How OGBench's observations scale positions, and where their origin is, in metres.
+_SCALES = {"cube": 10.0, "button": 120.0, "drawer": 18.0, "window": 15.0}
+_CENTRE = (0.425, 0.0, 0.0)
+# The joints of the fingers, as multiples of the angle that drives them.
+_FINGERS = {"driver": 1.0, "coupler": 0.0, "spring_link": 1.0, "follower": -1.0}
+
+
+def _ogbench(
+    states: NDArray[np.float64], layout: EntityLayout, task: str
+) -> NDArray[np.uint8]:
+    import mujoco
+
+    from torchrl_caiac.envs.ogbench import OGBenchSimulator
+    from torchrl_caiac.envs.rendering import OffscreenRenderer
+
+    simulator = OGBenchSimulator(task)
+    model = simulator.model
+    camera = {
+        "type": mujoco.mjtCamera.mjCAMERA_FIXED.value,
+        "fixedcamid": model.camera("front").id,
+    }
+    renderer = None
+    try:
+        renderer = OffscreenRenderer(model, *_SIZE, camera=camera)
+        frames = []
+        for state in states:
+            simulator.restore(_ogbench_state(simulator, state, layout))
+            frames.append(renderer.frame(simulator.data))
+        return np.stack(frames)
+    finally:
+        if renderer is not None:
+            renderer.close()
+        simulator.close()
+
+
+def _ogbench_state(
+    simulator: Any, state: NDArray[np.float64], layout: EntityLayout
+) -> NDArray[np.float64]:
+    """The simulator's state at rest that has the places of an observation."""
+    model = simulator.model
+    qpos, buttons = np.zeros(model.nq), []
+    robot = state[list(layout.columns["robot"])]
+    qpos[:6] = robot[:6]
+    for side in ("right", "left"):
+        for part, factor in _FINGERS.items():
+            joint = model.joint(f"ur5e/robotiq/{side}_{part}_joint")
+            qpos[joint.qposadr[0]] = factor * 0.8 * robot[17] / 3
+    for entity, place in simulator.places.items():
+        values = state[list(layout.columns[entity])]
+        kind = entity.rstrip("0123456789")
+        if kind == "cube":
+            position = values[:3] / _SCALES[kind] + _CENTRE
+            qpos[place] = np.concatenate([position, values[3:7]])
+        elif kind == "button":
+            qpos[place] = values[2] / _SCALES[kind]
+            buttons.append(float(values[1] > values[0]))
+        else:
+            qpos[place] = values[0] / _SCALES[kind]
+    return np.concatenate([qpos, np.zeros(model.nv), buttons])
 
 
 def as_pictures(recorded: Any, made: Any) -> tuple[str, str]:
