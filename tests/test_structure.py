@@ -47,6 +47,8 @@ LAYERS = [
     {"transforms"},
     {"evaluation"},
     {"plotting"},
+    {"augment", "inspection", "report", "scored"},
+    {"__main__", "cli"},
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))
