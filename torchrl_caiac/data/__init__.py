@@ -8,6 +8,8 @@ from torchrl_caiac.data.collect import collect_episodes, load_episode, record_ep
 from torchrl_caiac.data.digests import verify_digests, write_digests
 from torchrl_caiac.data.episodes import episode_transitions
 from torchrl_caiac.data.load_minari import load_minari
+from torchrl_caiac.data.load_ogbench import load_ogbench
+from torchrl_caiac.data.load_robomimic import load_robomimic
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
@@ -22,6 +24,8 @@ __all__ = [
     "episode_transitions",
     "load_episode",
     "load_minari",
+    "load_ogbench",
+    "load_robomimic",
     "load_transitions",
     "mix_trajectories",
     "offline_buffer",
@@ -30,15 +34,3 @@ __all__ = [
     "write_digests",
     "write_transitions",
 ]
-
-
-def open_dataset(
-    source, path, *, format=None, overwrite=False, progress=True, **options
-):  # SHIM
-    from torchrl_caiac.data.load_ogbench import load_ogbench
-
-    if str(source).endswith(".npz"):
-        return load_ogbench(source, path, progress=progress, **options)
-    return load_minari(
-        source.removeprefix("minari://"), path, progress=progress, **options
-    )
