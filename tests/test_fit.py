@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer, Unbounded
 
+import torchrl_caiac._fit_rows as fit_rows
 import torchrl_caiac.fit as module
 from tests.killing import run_killed
 from torchrl_caiac._files import whole_file
@@ -23,6 +23,7 @@ from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.modules.transformer_world_model import TransformerWorldModel
+from torchrl_caiac.noise import resting_noise
 from torchrl_caiac.objectives.entity_dynamics import EntityDynamicsLoss
 
 LAYOUT = EntityLayout({"arm": [0, 1], "cup": [2, 3]})
@@ -92,7 +93,9 @@ def test_learns_the_dynamics_and_where_the_cup_moves() -> None:
 def test_history_agrees_with_the_loss_on_the_held_out_rows() -> None:
     data, model = world(), make()
     history = fit(model, data, steps=40)
-    rows = module._split(data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0))
+    rows = fit_rows.split_rows(
+        data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0)
+    )
     held_out = data[rows[1]]
     assert len(held_out) == 200
     assert not set(held_out["episode"].tolist()) & set(
@@ -220,7 +223,9 @@ def test_transformers_are_fitted_and_resumed(tmp_path: Path) -> None:
     mse = history["validation_mse"][-1]
     assert mse["arm"] < 3e-4 and mse["cup"] < 1e-3  # of 0.0033 and 0.0015
     loss = EntityDynamicsLoss(model).eval()
-    rows = module._split(data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0))
+    rows = fit_rows.split_rows(
+        data["episode"], 0.1, 10**6, torch.Generator().manual_seed(0)
+    )
     held_out = loss(data[rows[1]])
     torch.testing.assert_close(
         history["validation_nll"][history["best"]][-1].float(),
@@ -289,7 +294,7 @@ def test_storages_and_memory_limits_make_no_difference(
     whole, mapped, streamed = make(), make(), make()
     expected = fit(whole, data)
     fit(mapped, data.memmap(tmp_path / "data"))
-    monkeypatch.setattr(module, "_CHUNK", 37)
+    monkeypatch.setattr(fit_rows, "CHUNK", 37)
     loaded = TensorDict.load_memmap(tmp_path / "data")
     history = fit(streamed, loaded, max_memory=0)
     assert_equal(whole, mapped)
@@ -311,34 +316,6 @@ def test_several_data_sets_are_one(max_memory: int) -> None:
     fit(one, data)
     fit(two, [first, second], max_memory=max_memory)
     assert_equal(one, two)
-
-
-def test_same_trajectory_number_in_two_data_sets_is_two_trajectories() -> None:
-    ids = torch.tensor([3, 3, 3, 9])
-    td = TensorDict({"episode": ids}, [4])
-    shaped = TensorDict({"episode": ids.unsqueeze(-1)}, [4])
-    numbers = module._trajectory_numbers([td, td[:0], shaped], "episode")
-    assert numbers.tolist() == [0, 0, 0, 1, 2, 2, 2, 3]
-
-
-def test_transitions_of_one_id_stay_together() -> None:
-    """Parallel environments interleave their transitions."""
-    td = TensorDict({"episode": torch.tensor([7, 2, 7, 2, 7])}, [5])
-    assert module._trajectory_numbers([td], "episode").tolist() == [1, 0, 1, 0, 1]
-
-
-@pytest.mark.parametrize("fraction", [0.01, 0.1, 0.5, 0.99])
-def test_split_holds_out_whole_trajectories(fraction: float) -> None:
-    trajectory = torch.randint(0, 13, (300,)).unique(return_inverse=True)[1]
-    train, validation = module._split(
-        trajectory, fraction, 10**6, torch.Generator().manual_seed(0)
-    )
-    assert sorted([*train.tolist(), *validation.tolist()]) == list(range(300))
-    left, right = set(trajectory[train].tolist()), set(trajectory[validation].tolist())
-    assert not left & right and left and right
-    assert len(right) == min(max(1, round(fraction * 13)), 12)
-    _, few = module._split(trajectory, fraction, 5, torch.Generator().manual_seed(0))
-    assert len(few) == 5 and set(few.tolist()) <= set(validation.tolist())
 
 
 def test_nested_keys() -> None:
@@ -377,6 +354,29 @@ def test_statistics_that_the_model_has_are_kept() -> None:
     scale = model.target_scale.clone()
     fit(model, world(400), steps=2)
     assert torch.equal(model.target_scale, scale)
+
+
+def test_an_automatic_floor_comes_from_the_data(tmp_path: Path) -> None:
+    data, path = world(), tmp_path / "fit"
+    halves = [data[:1000], data[1000:]]
+    model = make(variance_floor="auto")
+    assert not model.has_floor and model.config["variance_floor"] == "auto"
+    fit(model, halves, steps=40, checkpoint=path)
+    noise = resting_noise(data, LAYOUT)
+    floor = [f for name in LAYOUT.names for f in noise[name].floor]
+    torch.testing.assert_close(model.floor, torch.tensor(floor, dtype=torch.float64))
+    assert model.floor_reasons == {name: noise[name].reason for name in LAYOUT.names}
+    assert "rests" in model.floor_reasons["cup"]
+    # It is part of the checkpoint, and of the state that another model loads.
+    resumed = make(variance_floor="auto")
+    fit(resumed, halves, steps=60, checkpoint=path)
+    once = make(variance_floor="auto")
+    fit(once, halves, steps=60)
+    assert_equal(resumed, once)
+    twin = GaussianWorldModel.from_config(once.config)
+    twin.load_state_dict(once.state_dict())
+    assert twin.has_floor and twin.floor_reasons == once.floor_reasons
+    assert torch.equal(twin.floor, once.floor)
 
 
 def test_denormals_are_flushed_in_the_block_only() -> None:
@@ -582,43 +582,3 @@ def test_checkpoints_record_the_bounds(tmp_path: Path) -> None:
     del old["action_low"], old["action_high"]
     with pytest.raises(ValueError, match="is of an earlier version"):
         make().load_state_dict(old)
-
-
-# --- what the log says of a fit ------------------------------------------------------
-
-
-def test_a_good_fit_is_not_warned_of(caplog: pytest.LogCaptureFixture) -> None:
-    model = make(variance_floor=0.02)
-    fit(model, world(), action_spec=SPEC, steps=300, batch_size=128, lr=3e-3)
-    assert not caplog.records
-
-
-@pytest.mark.parametrize("target", ["change", "absolute"])
-def test_a_model_that_predicts_nothing_is_warned_of(
-    target: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    data = world()
-    data["action"] = data["action"][torch.randperm(2000)]  # not those that were taken
-    data["next", "observation"][:, 3] = data["observation"][:, 3]  # stays
-    data["next", "observation"][:, 2] = data["observation"][:, 2]
-    fit(make(target=target), data, action_spec=SPEC, steps=20, lr=1e-6, check=False)
-    (record,) = caplog.records
-    assert "the model predicts ['arm'] no better than 'nothing moves'" in (
-        record.getMessage()
-    )
-
-
-def test_overfitting_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
-    few = world(60)
-    few["next", "observation"] += torch.randn(60, 4)
-    fit(
-        make(variance_floor=1e-6),
-        few,
-        action_spec=SPEC,
-        steps=300,
-        batch_size=60,
-        eval_every=10,
-        lr=1e-2,
-    )
-    messages = [record.getMessage() for record in caplog.records]
-    assert any(re.match(r"the best step was \d0? of 300", text) for text in messages)

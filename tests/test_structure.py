@@ -38,6 +38,8 @@ LAYERS = [
     {"modules"},
     {"check"},
     {"objectives"},
+    {"_fit_rows"},
+    {"_fit_quality"},
     {"fit"},
     {"influence"},
     {"transforms"},

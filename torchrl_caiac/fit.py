@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,21 +15,17 @@ from tensordict.utils import NestedKey
 from torchrl.data import Bounded, ReplayBuffer
 from tqdm.auto import tqdm
 
-from torchrl_caiac._keys import as_key, floating, get_leaf, jsonable
+from torchrl_caiac._fit_quality import log_quality
+from torchrl_caiac._fit_rows import FitRows, split_rows, trajectory_numbers
+from torchrl_caiac._keys import as_key, jsonable
 from torchrl_caiac.check import check_before_use
 from torchrl_caiac.checkpoint import TrainingCheckpoint
-from torchrl_caiac.modules._action_bounds import (
-    check_actions,
-    filled_bounds,
-    known_bounds,
-)
+from torchrl_caiac.modules._action_bounds import filled_bounds, known_bounds
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
-from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = ["fit_world_model"]
 
 _LOGGER = logging.getLogger("torchrl_caiac.fit")
-_CHUNK = 65_536  # rows read from the data at once
 _EVAL_ROWS = 4_096  # rows in one forward pass in validation
 
 
@@ -168,12 +163,12 @@ def fit_world_model(
         )
     sources = [data] if isinstance(data, TensorDictBase) else list(data)
     bounds = known_bounds(sources, action_spec, model.action_dim)
-    rows = _Rows(model, sources, max_memory, bounds)
+    rows = FitRows(model, sources, max_memory, bounds)
     low, high = filled_bounds(rows.action_range, bounds, model.action_key)
     generator = torch.Generator().manual_seed(seed)
     key = as_key(trajectory_key)
-    train, validation = _split(
-        _trajectory_numbers(sources, key),
+    train, validation = split_rows(
+        trajectory_numbers(sources, key),
         validation_fraction,
         max_validation_rows,
         generator,
@@ -206,6 +201,8 @@ def fit_world_model(
         fit.step = keeper.load(max_step=steps)
         if fit.step:
             _LOGGER.info("resuming at step %d of %s", fit.step, keeper.path)
+    if not model.has_floor:
+        model.fit_variance_floor(sources)
     if not model.fitted:
         model.fit_statistics(rows.raw_targets(train))
     model.set_action_bounds(low, high)
@@ -243,14 +240,17 @@ def fit_world_model(
                 keeper.save(fit.step)
     model.load_state_dict(fit.best)
     model.eval()
-    _log_quality(fit, rows, validation)
+    log_quality(model, fit.history, rows, train, validation)
     return fit.table()
 
 
 def _check(
     model: EntityDynamicsModel, sources: Sequence[TensorDictBase], key: NestedKey
 ) -> None:
-    config = model.config
+    floors = None
+    # The floor of absolute targets is not that of changes.
+    if model.has_floor and model.target == "change":
+        floors = model.entity_floors()
     for td in sources:
         if len(td):
             check_before_use(
@@ -259,127 +259,9 @@ def _check(
                 action_key=model.action_key,
                 reward_key=None,
                 trajectory_key=key,
-                # The floor of absolute targets is not that of changes.
-                variance_floor=config["variance_floor"]
-                if model.target == "change"
-                else None,
-                predict=config["predict"],
+                variance_floor=floors,
+                predict=model.config["predict"],
             )
-
-
-class _Rows:
-    """The columns that the model reads, of several datasets, by row number."""
-
-    def __init__(
-        self,
-        model: EntityDynamicsModel,
-        sources: Sequence[TensorDictBase],
-        max_memory: int,
-        bounds: tuple[torch.Tensor, torch.Tensor] | None,
-    ) -> None:
-        self.model, self.sources, self.bounds = model, sources, bounds
-        for td in sources:
-            if td.batch_dims != 1:
-                raise ValueError(
-                    f"the data have the batch size {list(td.batch_size)}, expected "
-                    "flat transitions [T]: use td.reshape(-1)"
-                )
-        self.lengths = [len(td) for td in sources]
-        total = sum(self.lengths)
-        if not total:
-            raise ValueError("the data are empty: collect or load transitions first")
-        self.starts = torch.tensor([0, *self.lengths]).cumsum(0)
-        self.sizes = [model.state_dim, model.action_dim, model.predict_dim]
-        width = sum(self.sizes)
-        self.device = model.device
-        self.block: torch.Tensor | None = None
-        if total * width * 4 <= max_memory:
-            self.block = torch.empty(total, width)
-        self.checksum = 0
-        self.action_range = (
-            torch.full((model.action_dim,), math.inf),
-            torch.full((model.action_dim,), -math.inf),
-        )
-        for first, part in self._chunks():
-            action = part.split(self.sizes, 1)[1]
-            self.action_range = (
-                torch.minimum(self.action_range[0], action.amin(0)),
-                torch.maximum(self.action_range[1], action.amax(0)),
-            )
-            self.checksum = zlib.crc32(part.numpy().data, self.checksum)
-            if self.block is not None:
-                self.block[first : first + len(part)] = part
-        if self.block is not None:
-            self.block = self.block.to(self.device)
-
-    def _chunks(self) -> Iterator[tuple[int, torch.Tensor]]:
-        model = self.model
-        first = 0
-        for td in self.sources:
-            for start in range(0, len(td), _CHUNK):
-                part = td[start : start + _CHUNK]
-                action = get_leaf(
-                    part,
-                    model.action_key,
-                    "the data lack the action",
-                    "name its leaf with the model's action_key",
-                )
-                state = model.layout.read(part)
-                after = model.layout.read(part, next=True)
-                for what, x, size in (
-                    ("the entities' features", state, model.state_dim),
-                    ("the entities' next features", after, model.state_dim),
-                    (f"{model.action_key!r}", action, model.action_dim),
-                ):
-                    if tuple(x.shape) != (len(part), size):
-                        raise ValueError(
-                            f"the shape of {what} is {list(x.shape)}, expected "
-                            f"{[len(part), size]}: give the data that the model's "
-                            "layout describes"
-                        )
-                model.check_finite(state, first_row=first)
-                model.check_finite(after, next=True, first_row=first)
-                model.check_finite_action(action, first_row=first)
-                if self.bounds is not None:
-                    check_actions(
-                        action, *self.bounds, model.action_key, first_row=first
-                    )
-                yield first, self._columns(state, action, after)
-                first += len(part)
-
-    def _columns(
-        self, state: torch.Tensor, action: torch.Tensor, after: torch.Tensor
-    ) -> torch.Tensor:
-        # The change is computed before the cast, to keep small changes of float64 data.
-        state, action, after = state.cpu(), action.cpu(), after.cpu()
-        index = self.model.index.cpu()
-        raw = floating(after[:, index])
-        if self.model.target == "change":
-            raw = raw - floating(state[:, index])
-        return torch.cat([state.float(), action.float(), raw.float()], 1)
-
-    def get(self, index: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns states, actions and raw targets of rows, on the model's device."""
-        if self.block is not None:
-            return self.block[index.to(self.device)].split(self.sizes, 1)
-        model, layout = self.model, self.model.layout
-        out = torch.empty(len(index), sum(self.sizes))
-        source = torch.bucketize(index, self.starts[1:], right=True)
-        for number, td in enumerate(self.sources):
-            where = (source == number).nonzero()[:, 0]
-            if len(where):
-                part = td[index[where] - self.starts[number]]
-                out[where] = self._columns(
-                    layout.read(part),
-                    part.get(model.action_key),
-                    layout.read(part, next=True),
-                )
-        return out.to(self.device).split(self.sizes, 1)
-
-    def raw_targets(self, index: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Yields the raw targets of rows, in chunks."""
-        for part in index.split(_CHUNK):
-            yield self.get(part)[2]
 
 
 class _Fit:
@@ -400,7 +282,7 @@ class _Fit:
         self.train_count = 0
 
     @torch.no_grad()
-    def validate(self, rows: _Rows, index: torch.Tensor) -> None:
+    def validate(self, rows: FitRows, index: torch.Tensor) -> None:
         """Adds a row to the history, and keeps the model's state if it is the best."""
         model = self.model
         model.eval()
@@ -474,97 +356,11 @@ class _Fit:
             setattr(self, name, state[name])
 
 
-@torch.no_grad()
-def _log_quality(fit: _Fit, rows: _Rows, validation: torch.Tensor) -> None:
-    """Logs a warning if the model overfits, or predicts no better than no motion."""
-    model = fit.model
-    best = [row for row in fit.history if row["best"]][-1]
-    if best["step"] <= 0.1 * fit.step:
-        _LOGGER.warning(
-            "the best step was %d of %d: the model overfits after it. Collect more "
-            "data, make the model smaller, or lower steps",
-            best["step"],
-            fit.step,
-        )
-    change = torch.zeros(model.predict_dim, dtype=torch.float64)
-    for part in validation.split(_CHUNK):
-        state, _, raw = rows.get(part)
-        if model.target != "change":
-            raw = raw - state[:, model.index]
-        change += raw.double().square().sum(0).cpu()
-    change /= len(validation)
-    # Changes below the floor count as noise, which no model predicts.
-    floor = model.floor.cpu().square()
-    still = [
-        name
-        for name, where in model.predicted.items()
-        if change[where].mean() > floor[where].mean()
-        and best[f"mse/{name}"] >= change[where].mean()
-    ]
-    if still:
-        _LOGGER.warning(
-            "the model predicts %s no better than 'nothing moves': its scores "
-            "are not reliable. Fit more steps, or check that the data have the "
-            "actions that cause the next states",
-            still,
-        )
-
-
 def _copy(state: dict[str, Any]) -> dict[str, Any]:
     return {
         key: value.detach().clone() if isinstance(value, torch.Tensor) else value
         for key, value in state.items()
     }
-
-
-def _trajectory_numbers(
-    sources: Sequence[TensorDictBase], key: NestedKey
-) -> torch.Tensor:
-    """Returns the number of each row's trajectory, int64 ``[T]``."""
-    parts: list[torch.Tensor] = []
-    offset = 0
-    for td in sources:
-        if not len(td):
-            continue
-        ids = get_leaf(
-            td,
-            key,
-            "the data lack the trajectory key",
-            "name the leaf that has the trajectory ids, so that whole trajectories can "
-            "be held out for validation",
-        )
-        if ids.is_floating_point():
-            raise ValueError(f"{key!r} is {ids.dtype}, expected integers")
-        index = trajectory_index(td, trajectory_key=key, done_key=None)
-        # Numbered by id, so that the split does not depend on the order of the data.
-        group = ids.reshape(-1)[index.starts].unique(return_inverse=True)[1]
-        parts.append(group[index.numbers()].cpu() + offset)
-        offset = int(parts[-1].max()) + 1
-    return torch.cat(parts)
-
-
-def _split(
-    trajectory: torch.Tensor,
-    fraction: float,
-    max_validation_rows: int,
-    generator: torch.Generator,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the rows for training and for validation, in whole trajectories."""
-    count = int(trajectory.max()) + 1
-    if count < 2:
-        raise ValueError(
-            "the data contain a single trajectory, expected at least two, one of them "
-            "for validation: collect more, or correct trajectory_key"
-        )
-    held_out = min(max(1, round(fraction * count)), count - 1)
-    validates = torch.zeros(count, dtype=torch.bool)
-    validates[torch.randperm(count, generator=generator)[:held_out]] = True
-    mask = validates[trajectory]
-    validation = mask.nonzero()[:, 0]
-    if len(validation) > max_validation_rows:
-        choice = torch.randperm(len(validation), generator=generator)
-        validation = validation[choice[:max_validation_rows]].sort().values
-    return (~mask).nonzero()[:, 0], validation
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from torchrl_caiac._layout_units import position_features
 from torchrl_caiac._torchrl import storage_rows
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["EntityNoise", "resting_noise"]
+__all__ = ["EntityNoise", "resting_noise", "sample_rows"]
 
 _SHARE = 0.1  # of the median change while it moves: smaller changes do not matter
 _DEVIATIONS = 4.0  # of the noise: larger changes are motion
@@ -105,7 +105,7 @@ def resting_noise(
         >>> round(cup.floor[0], 4), round(cup.noise[0], 4)
         (0.05, 0.001)
     """
-    rows = _sample(data, max_rows)
+    rows = sample_rows(data, max_rows)
     layout.check(rows, next=True)
     now = layout.read(rows).double().flatten(0, -2)
     after = layout.read(rows, next=True).double().flatten(0, -2)
@@ -131,7 +131,26 @@ def resting_noise(
     return result
 
 
-def _sample(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBase:
+def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBase:
+    """Returns evenly spaced rows of a dataset.
+
+    Args:
+        data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
+        max_rows (int): the largest number of rows.
+
+    Returns:
+        TensorDictBase: ``[n]``; all rows, not copied, if there are not more.
+
+    Raises:
+        ValueError: there are no rows, or ``max_rows`` is less than 1.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.noise import sample_rows
+        >>> sample_rows(TensorDict({"x": torch.arange(9)}, [9]), 3)["x"]
+        tensor([0, 4, 8])
+    """
     if isinstance(max_rows, bool) or not isinstance(max_rows, int) or max_rows < 1:
         raise ValueError(f"max_rows must be an int of at least 1, got {max_rows!r}")
     if isinstance(data, ReplayBuffer):

@@ -132,7 +132,7 @@ def test_images_are_kept_by_name_and_said_to_be_left_out(file, caplog):
     data = load(file, images=["agentview_image"], exclude=["object"], overwrite=True)
     images = data["observation", "agentview_image"].numpy()
     assert np.array_equal(images, stacked("agentview_image", slice(0, -1)))
-    assert "object" not in data["observation"].keys()
+    assert "object" not in set(data["observation"].keys())
 
 
 def test_masks_select_demonstrations(file):
@@ -184,7 +184,7 @@ def test_observations_of_libero_are_those_after_the_actions(tmp_path, caplog):
 
 
 def test_observations_after_the_actions_contradict_next_observations(file):
-    with pytest.raises(ValueError, match="demo_0 of .* has next_obs"):
+    with pytest.raises(ValueError, match=r"demo_0 of .* has next_obs"):
         load(file, observed="after")
 
 
@@ -229,7 +229,7 @@ def replaced(key, value):
             replaced("data/demo_2/obs/object", np.zeros((4, 5))),
             {},
             ValueError,
-            r"demo_2 of .*'object'.*\[4, 5\].*\[4, 4\]",
+            r"'object'. in demo_2 of .*low.hdf5 has shape .4, 5. .* and .4, 4.",
         ),
         (
             replaced("data/demo_2/actions", np.zeros((4, 6))),
@@ -271,7 +271,7 @@ def one_row(file):
 
 def test_a_demonstration_of_one_row_is_refused(tmp_path):
     file = write(tmp_path / "a.hdf5", edit=one_row)
-    with pytest.raises(ValueError, match="demo_2 of .*a.hdf5 has one row only"):
+    with pytest.raises(ValueError, match=r"demo_2 of .*a.hdf5 has one row only"):
         load(file)
     assert os.listdir(tmp_path) == ["a.hdf5"]
 
@@ -279,12 +279,12 @@ def test_a_demonstration_of_one_row_is_refused(tmp_path):
 def test_a_file_cut_short_is_refused(file):
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
-    with pytest.raises(UnreadableFileError, match="low_dim.hdf5 is not a readable"):
+    with pytest.raises(UnreadableFileError, match=r"low_dim.hdf5 is not a readable"):
         load(file)
     file.write_bytes(b"")
-    with pytest.raises(UnreadableFileError, match="low_dim.hdf5"):
+    with pytest.raises(UnreadableFileError, match=r"low_dim.hdf5"):
         load(file)
-    with pytest.raises(FileNotFoundError, match="no file .*other.hdf5"):
+    with pytest.raises(FileNotFoundError, match=r"no file .*other.hdf5"):
         load(file.with_name("other.hdf5"))
     assert os.listdir(file.parent) == [file.name]
 
@@ -292,9 +292,9 @@ def test_a_file_cut_short_is_refused(file):
 def test_parts_that_were_never_written_are_refused(tmp_path):
     def edit(file):
         del file["data/demo_2/actions"]
-        file["data/demo_2"].create_dataset("actions", (4, 7), chunks=(1, 7))
+        file["data/demo_2"].create_dataset("actions", (4, 7), "f8", chunks=(1, 7))
 
-    with pytest.raises(UnreadableFileError, match="actions .*were not written"):
+    with pytest.raises(UnreadableFileError, match=r"actions .*were not written"):
         load(write(tmp_path / "a.hdf5", edit=edit))
 
 
@@ -307,5 +307,5 @@ def test_links_to_other_files_are_refused(tmp_path):
             str(tmp_path / "other.hdf5"), "data/demo_2/actions"
         )
 
-    with pytest.raises(UnreadableFileError, match="demo_2.*link"):
+    with pytest.raises(UnreadableFileError, match=r"demo_2.*link"):
         load(write(tmp_path / "a.hdf5", edit=edit))

@@ -12,6 +12,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence import CAI
+from torchrl_caiac.influence.estimator_digest import estimator_digest
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel, _softplus
 
 LAYOUT = EntityLayout({"arm": [0, 1, 4], "cup": [6, 5], "lid": [2]})
@@ -332,11 +334,97 @@ def test_state_dict_carries_statistics_and_compares_arguments(tmp_path: Path) ->
         ({"hidden_sizes": (9,)}, "hidden_sizes"),
         ({"predict": {"arm": [0]}}, "predict"),
         ({"target": "absolute"}, "target"),
+        ({"inputs": {"arm": [0]}}, "inputs"),
     ):
         arguments: dict[str, Any] = {"hidden_sizes": (8,), "variance_floor": 0.01}
         other = GaussianWorldModel(LAYOUT, 2, **{**arguments, **change})
         with pytest.raises(ValueError, match=f"another {name}"):
             other.load_state_dict(state)
+
+
+# --- columns that the model reads ---------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", [LAYOUT, NESTED])
+def test_inputs_are_all_that_a_model_reads(layout: EntityLayout) -> None:
+    flat = layout is LAYOUT
+    td, actions = transitions(50), torch.rand(9, 2)
+    model = GaussianWorldModel(
+        layout,
+        2,
+        (16, 16),
+        widths=None if flat else {"arm": 3, "cup": 2, "lid": 1},
+        inputs={"arm": (), "cup": [5] if flat else [1]},
+    )
+    model.fit_statistics(td if flat else nested(td))
+    assert model.input_dim == 2 and model.predict_dim == 6
+    assert model.hidden[0].in_features == 4
+    state = LAYOUT.read(td)
+    model(td if flat else nested(td))  # merges the statistics
+    torch.testing.assert_close(model.state_norm.mean, state[:, 4:].mean(0).double())
+    model.eval()
+    # The same network, whose input is made by hand.
+    x = model.state_norm(state[:, [4, 5]])
+    x = torch.cat([x, model.action_norm(td["action"])], -1)
+    for layer in model.hidden:
+        x = layer(x).relu()
+    loc, _ = model.forward_tensors(state, td["action"])
+    torch.testing.assert_close(loc, model.loc_head(x))
+    changed = state.clone()
+    changed[:, :4] = torch.randn(50, 4)
+    for one, other in zip(
+        model.forward_tensors(state, td["action"]),
+        model.forward_tensors(changed, td["action"]),
+        strict=True,
+    ):
+        assert torch.equal(one, other)
+    for one, other in zip(
+        model.for_actions(actions)(changed),
+        model.forward_tensors(state[:, None], actions[None]),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other)
+    # Targets are those of all entities.
+    whole = GaussianWorldModel(LAYOUT, 2, (8,))
+    whole.fit_statistics(td)
+    assert torch.equal(model.target_scale, whole.target_scale)
+
+
+def test_inputs_are_saved_and_old_configs_are_those_of_all_columns() -> None:
+    every = {"arm": [0, 1, 4], "cup": [6, 5], "lid": [2]}
+    plain = GaussianWorldModel(LAYOUT, 2, (8,))
+    named = GaussianWorldModel(LAYOUT, 2, (8,), inputs=every)
+    assert "inputs" not in plain.config and named.config == plain.config
+    some = GaussianWorldModel(LAYOUT, 2, (8,), inputs={"arm": [4, 0], "lid": ()})
+    assert some.config["inputs"] == {"arm": [4, 0], "cup": [6, 5], "lid": []}
+    twin = GaussianWorldModel.from_config(some.config)
+    twin.load_state_dict(some.state_dict())
+    assert twin.config == some.config and twin.input_index.tolist() == [2, 0, 3, 4]
+    with pytest.raises(ValueError, match=r"(?s)another inputs.*\[4, 0\].*None"):
+        plain.load_state_dict(some.state_dict())
+    with pytest.raises(ValueError, match=r"(?s)another inputs.*None.*\[4, 0\]"):
+        some.load_state_dict(plain.state_dict())
+
+
+def test_scores_depend_on_the_inputs_alone() -> None:
+    td = transitions(40)
+    model = GaussianWorldModel(LAYOUT, 2, (16,), inputs={"arm": [4], "lid": ()})
+    model.fit_statistics(td)
+    model.set_action_bounds(-1.0, 1.0)
+    cai = CAI(model.eval(), num_actions=8)
+    changed = td.clone()
+    changed["observation"][:, :4] = 0.0  # columns 0, 1 and 2 of the entities, and 3
+    assert torch.equal(cai(changed), cai(td))
+    changed["observation"][:, 4] = 0.0
+    assert not torch.equal(cai(changed), cai(td))
+    other = GaussianWorldModel(LAYOUT, 2, (16,), inputs={"arm": [1], "lid": ()})
+    other.fit_statistics(td)
+    other.load_state_dict({**model.state_dict(), **_extra(other)})
+    assert estimator_digest(CAI(other.eval(), 8)) != estimator_digest(cai)
+
+
+def _extra(model: GaussianWorldModel) -> dict[str, Any]:
+    return {"_extra_state": model.get_extra_state()}
 
 
 def test_copies_and_pickles() -> None:
@@ -362,6 +450,10 @@ def test_copies_and_pickles() -> None:
         ({"variance_floor": float("nan")}, "variance_floor"),
         ({"variance_floor": {"arm": 1.0}}, r"predicted entities \['arm', 'cup'"),
         ({"variance_floor": {"arm": 1, "cup": [1, 2, 3], "lid": 1}}, "of its 2"),
+        ({"inputs": {"hand": [0]}}, r"inputs names \['hand'\].*'arm', 'cup', 'lid'"),
+        ({"inputs": {"cup": [0]}}, r"inputs gives entity 'cup' .*does not own"),
+        ({"inputs": {"cup": [5, 5]}}, "'cup' .* at most once"),
+        ({"inputs": {"arm": (), "cup": (), "lid": ()}}, "same in every state"),
         ({"target": "delta"}, "'change' or 'absolute', got 'delta'"),
         ({"max_variance": 0.0}, "max_variance"),
         ({"out_keys": ("loc",)}, "two keys"),

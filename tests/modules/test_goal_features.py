@@ -104,6 +104,24 @@ def test_widths_of_fetch_push():
     assert GoalFeatures(push(), relative=False).width == 34 + 6
 
 
+def test_reference_columns_are_those_given_or_the_positions_of_the_layout():
+    td = rows(4)
+    state = td["observation"]
+    given = {"reference": "gripper", "reference_columns": [5, 4, 9]}
+    cases = [
+        (push(), {"reference": "gripper"}, [0, 1, 2]),
+        (push(), given, [5, 4, 9]),
+        (push(positions={"gripper": [7, 8, 6]}), {"reference": "gripper"}, [7, 8, 6]),
+        (push(positions={"gripper": [7, 8, 6]}), given, [5, 4, 9]),
+        (push(positions={"cube0": [11]}), {"reference": "gripper"}, [0, 1, 2]),
+    ]
+    for layout, kwargs, columns in cases:
+        got = GoalFeatures(layout, **kwargs)(td)["features"][:, 40:46]
+        achieved = torch.cat([state[:, 10:13], state[:, 22:25]], -1)
+        want = achieved - state[:, columns * 2]
+        torch.testing.assert_close(got, want)
+
+
 def test_a_swap_moves_the_relative_features():
     """They are computed from the swapped state."""
     features = GoalFeatures(push(), reference="gripper")
@@ -169,6 +187,27 @@ def test_nested_keys_and_dispatch():
         (EntityLayout.from_keys({"arm": "arm"}), {}, "flat layout"),
         (push(), {"reference": "hand"}, "'hand'.*not an entity"),
         (push(), {"reference": "gripper", "relative": False}, "relative features only"),
+        (push(), {"reference_columns": [0, 1, 2]}, "name it, reference="),
+        (
+            push(),
+            {"reference": "gripper", "reference_columns": [0, 1, 10]},
+            r"reference_columns are \[0, 1, 10\].*'gripper'",
+        ),
+        (
+            push(),
+            {"reference": "gripper", "reference_columns": [0, 0, 1]},
+            "each at most once",
+        ),
+        (
+            push(),
+            {"reference": "gripper", "reference_columns": [0, 1, 2, 3]},
+            r"'cube0' has 3 goal columns.*'gripper' has 4 columns \[0, 1, 2, 3\]",
+        ),
+        (
+            push(positions={"gripper": [0, 1]}),
+            {"reference": "gripper"},
+            "'cube0' has 3 goal columns.*give reference_columns",
+        ),
         (push(), {"floor": 0.0}, "floor"),
         (push(), {"floor": float("nan")}, "floor"),
         (

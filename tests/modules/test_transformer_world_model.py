@@ -38,10 +38,16 @@ def transitions(*batch: int, dtype: Any = torch.float32) -> TensorDict:
 
 
 def by_hand(
-    model: TransformerWorldModel, td: TensorDict
+    model: TransformerWorldModel,
+    td: TensorDict,
+    inputs: dict[str, list[int]] | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Prediction and attention, token by token and head by head."""
     state, action = model.layout.read(td), td["action"]
+    widths = WIDTHS
+    if inputs is not None:
+        state = td["observation"][:, [c for own in inputs.values() for c in own]]
+        widths = {name: len(own) for name, own in inputs.items()}
     norms = [model.state_norm, model.action_norm]
     x = torch.cat(
         [
@@ -51,7 +57,7 @@ def by_hand(
         -1,
     ).float()
     tokens, start = [], 0
-    for size, layer in zip([*WIDTHS.values(), 2], model.inputs, strict=True):
+    for size, layer in zip([*widths.values(), 2], model.inputs, strict=True):
         tokens.append(layer(x[:, start : start + size]))
         start += size
     x = torch.stack(tokens, 1)
@@ -96,6 +102,22 @@ def test_prediction_and_attention_are_those_made_by_hand(
         torch.testing.assert_close(model(td)["prediction", "loc"], loc)
     assert loc.shape == (20, 6 if predict is None else 2)
     torch.testing.assert_close(attention.sum(-1), torch.ones(20, 2, 4))
+
+
+def test_tokens_are_made_of_the_inputs() -> None:
+    inputs = {"arm": [4, 0], "cup": [5], "lid": [2]}
+    model, td = make(inputs={"arm": [4, 0], "cup": [5]}), transitions(20)
+    model(td)  # makes the statistics
+    model.eval()
+    loc, attention = by_hand(model, td, inputs)
+    torch.testing.assert_close(model(td)["prediction", "loc"], loc)
+    torch.testing.assert_close(
+        model.attention(LAYOUT.read(td), td["action"]), attention
+    )
+    assert loc.shape == (20, 6)
+    twin = TransformerWorldModel.from_config(model.config)
+    twin.load_state_dict(model.state_dict())
+    assert twin.config["inputs"] == inputs
 
 
 def test_keys_and_predicted_slices() -> None:
@@ -243,6 +265,7 @@ def test_config_copies_and_pickles(layout: EntityLayout) -> None:
         ({"out_keys": ["a", "b"]}, "out_keys must be one key"),
         ({"target": "next"}, "'change' or 'absolute'"),
         ({"predict": {"pot": [1]}}, "not entities of this layout"),
+        ({"inputs": {"lid": ()}}, r"inputs give \['lid'\] no columns"),
     ],
 )
 def test_wrong_arguments(kwargs: dict[str, Any], message: str) -> None:

@@ -24,7 +24,8 @@ from torchrl_caiac.check.state import States, read_states
 from torchrl_caiac.check.succession import Succession, check_succession
 from torchrl_caiac.check.values import check_action, check_finite, find_padding
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.modules._predicted_columns import checked_floor, checked_predict
+from torchrl_caiac.modules._predicted_columns import checked_predict
+from torchrl_caiac.modules._variance_floor import checked_floor
 from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
 __all__ = ["check_before_use", "check_dataset"]
@@ -397,8 +398,8 @@ class _Check:
     ) -> dict[str, dict[int, float]] | None:
         """Returns the variance floor of each predicted column, by entity."""
         layout = self.layout
-        if floor is None:
-            return None
+        if floor is None or (isinstance(floor, str) and floor == "auto"):
+            return None  # "auto" is known once a model is fitted
         try:
             widths = layout.widths(None if layout.is_flat else self.data[:1])
         except KeyError:

@@ -7,6 +7,8 @@ from torchrl_caiac.data.action_bounds import action_bounds
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
 from torchrl_caiac.data.digests import verify_digests, write_digests
 from torchrl_caiac.data.episodes import episode_transitions
+from torchrl_caiac.data.from_arrays import from_arrays
+from torchrl_caiac.data.from_stream import from_stream
 from torchrl_caiac.data.load_minari import load_minari
 from torchrl_caiac.data.load_ogbench import load_ogbench
 from torchrl_caiac.data.load_robomimic import load_robomimic
@@ -22,6 +24,8 @@ __all__ = [
     "action_bounds",
     "collect_episodes",
     "episode_transitions",
+    "from_arrays",
+    "from_stream",
     "load_episode",
     "load_minari",
     "load_ogbench",

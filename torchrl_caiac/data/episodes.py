@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
 
+from torchrl_caiac.data.array_trees import cut, to_numpy
+
 __all__ = ["episode_transitions"]
 
 # The names that entries of an observation must not have.
@@ -132,7 +134,7 @@ def episode_transitions(
     if info:
         kept = reader.arrays(info, ("info",))
         reader.check_lengths(kept, (length, length + 1), above=("info",))
-        kept = _cut(kept, slice(0, length))
+        kept = cut(kept, slice(0, length))
         td["info"] = reader.tensors(kept, ("info",), cast=False)
     return td
 
@@ -198,14 +200,7 @@ class _Reader:
             raise ValueError(
                 f"{key!r} in {self.where} has masked values: {self.remove}"
             )
-        if isinstance(value, torch.Tensor):
-            value = value.detach().cpu().as_subclass(torch.Tensor)
-            # NumPy has no bfloat16.
-            value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
-        try:
-            array = np.asarray(value)
-        except ValueError:  # lists of different lengths
-            array = np.empty(0, object)
+        array = to_numpy(value)
         if array.dtype.kind not in "biuf" or array.dtype == np.longdouble:
             kind = {"O": "Python objects", "S": "bytes", "U": "text"}
             raise ValueError(
@@ -330,13 +325,6 @@ def _length(value: Any) -> int:
     while isinstance(value, dict):
         value = next(iter(value.values()))
     return len(value) if value.ndim else -1
-
-
-def _cut(tree: Mapping[str, Any], rows: slice) -> dict[str, Any]:
-    return {
-        key: _cut(value, rows) if isinstance(value, dict) else value[rows]
-        for key, value in tree.items()
-    }
 
 
 def _shape(value: Any) -> Any:

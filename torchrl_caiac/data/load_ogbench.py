@@ -12,14 +12,11 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDict
-from tqdm.auto import tqdm
 
 from torchrl_caiac.data.digests import file_digest
 from torchrl_caiac.data.episodes import episode_transitions
-from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.npz_streams import ArrayKind, NpzStreams
-from torchrl_caiac.data.transition_writer import TransitionWriter
-from torchrl_caiac.data.write_transitions import check_free
+from torchrl_caiac.data.write_episodes import Part, write_episodes
 
 __all__ = ["load_ogbench"]
 
@@ -31,7 +28,8 @@ _NEEDED = ("observations", "actions", "terminals")
 # Neither of these is an entry of "info".
 _KNOWN = {*_NEEDED, "next_observations", "rewards", "valids"}
 # Their robot takes actions [-1, 1] x 5, see ManipSpaceEnv.action_space of OGBench.
-_MANIPULATION, _MANIPULATION_ACTION = ("cube-", "scene-", "puzzle-"), 5
+_MANIPULATION = ("cube-", "scene-", "puzzle-")
+_MANIPULATION_BOUNDS = ([-1.0] * 5, [1.0] * 5)
 
 
 class _Arrays(Protocol):
@@ -76,7 +74,8 @@ def load_ogbench(
     ``ogbench.make_env_and_datasets`` returns them, are read as well. No episode of
     OGBench ends by its task: the last row counts as truncated.
 
-    The files are read a few rows at a time, so that they may be larger than the memory.
+    The files are read one episode at a time, so that they may be larger than the
+    memory. A second call with the same file and arguments opens the folder.
 
     Args:
         dataset (str or path): a file ``.npz``, or the name of a dataset, such as
@@ -108,7 +107,8 @@ def load_ogbench(
         TensorDict: the memory-mapped transitions, ``[T]``.
 
     Raises:
-        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        FileExistsError: ``path`` exists, was not written by an equal call, and
+            ``overwrite`` is ``False``.
         FileNotFoundError: the dataset is not on this machine.
         ImportError: the package ``ogbench`` is needed and missing.
         KeyError: the file lacks an array that is needed or excluded.
@@ -140,42 +140,28 @@ def load_ogbench(
     """
     if split not in ("train", "val"):
         raise ValueError(f"split is {split!r}, expected 'train' or 'val'")
-    check_free(path, overwrite)
     found = _find(dataset, split, root, download)
-    source = {**found.source, "exclude": sorted(exclude)}
     with found.open as arrays:
         lengths, has_next = _check(arrays, found.name, exclude)
         assumed = action_bounds is None and _is_manipulation(found.title, arrays)
         if assumed:
-            action_bounds = (
-                [-1.0] * _MANIPULATION_ACTION,
-                [1.0] * _MANIPULATION_ACTION,
-            )
+            action_bounds = _MANIPULATION_BOUNDS
             _logger.info(
                 "%s: the actions of this environment are in [-1, 1]; pass "
                 "action_bounds= if yours are not",
                 found.name,
             )
-        rows = sum(lengths) - (0 if has_next else len(lengths))
-        with TransitionWriter(
+        return write_episodes(
+            _episodes(arrays, lengths, has_next, found.name, exclude, assumed),
             path,
-            overwrite=overwrite,
+            source={**found.source, "exclude": sorted(exclude)},
             action_bounds=action_bounds,
-            source=source,
-            rows=rows,
-        ) as writer:
-            bar = tqdm(
-                _episodes(arrays, lengths, has_next, found.name, exclude),
-                total=len(lengths),
-                desc=f"loading {found.title}",
-                unit="episode",
-                disable=not progress,
-            )
-            for where, episode in bar:
-                if assumed:
-                    _check_range(episode, where)
-                writer.add(episode, where=where)
-    return load_transitions(path)
+            overwrite=overwrite,
+            progress=progress,
+            rows=sum(lengths) - (0 if has_next else len(lengths)),
+            total=len(lengths),
+            description=f"loading {found.title}",
+        )
 
 
 def _find(
@@ -346,7 +332,8 @@ def _episodes(
     has_next: bool,
     name: str,
     exclude: Sequence[str],
-) -> Iterator[tuple[str, TensorDict]]:
+    check_range: bool,
+) -> Iterator[Part]:
     names = [
         key for key in arrays.kinds if key not in ("terminals", "valids", *exclude)
     ]
@@ -356,23 +343,25 @@ def _episodes(
         info = {key: value for key, value in part.items() if key not in _KNOWN}
         # Without next observations, the last action has none, and is left out.
         steps = length if has_next else length - 1
-        yield (
-            where,
-            episode_transitions(
-                part["observations"],
-                part["actions"][:steps],
-                where=where,
-                rewards=part["rewards"][:steps] if "rewards" in part else None,
-                next_observations=part["next_observations"] if has_next else None,
-                info=info,
-                leave_out="pass exclude=[...]",
-            ),
+        rows = episode_transitions(
+            part["observations"],
+            part["actions"][:steps],
+            where=where,
+            rewards=part["rewards"][:steps] if "rewards" in part else None,
+            next_observations=part["next_observations"] if has_next else None,
+            info=info,
+            leave_out="leave it out with exclude=",
         )
+        if check_range:
+            _check_range(rows, where)
+        yield Part(rows, where)
 
 
 def _is_manipulation(title: str, arrays: _Arrays) -> bool:
     shape = arrays.kinds["actions"].shape
-    return title.startswith(_MANIPULATION) and shape[1:] == (_MANIPULATION_ACTION,)
+    return title.startswith(_MANIPULATION) and shape[1:] == (
+        len(_MANIPULATION_BOUNDS[0]),
+    )
 
 
 def _check_range(episode: TensorDict, where: str) -> None:

@@ -5,22 +5,19 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from tensordict import TensorDict
-from tqdm.auto import tqdm
 
 from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac.data.digests import file_digest
 from torchrl_caiac.data.episodes import episode_transitions
 from torchrl_caiac.data.join_columns import column_ranges, join_columns
-from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.minari_checks import check_hdf5_group
-from torchrl_caiac.data.transition_writer import TransitionWriter
-from torchrl_caiac.data.write_transitions import check_free
+from torchrl_caiac.data.write_episodes import Part, write_episodes
 
 __all__ = ["load_robomimic"]
 
@@ -70,7 +67,8 @@ def load_robomimic(
     environments go on. Hence its last row counts as truncated. ``dones`` are kept with
     ``infos=["dones"]``.
 
-    The package ``h5py`` is needed, robomimic and robosuite are not.
+    The package ``h5py`` is needed, robomimic and robosuite are not. A second call with
+    the same file and arguments opens the folder.
 
     Args:
         file (str or Path): the HDF5 file, with ``data/demo_*/obs``.
@@ -107,7 +105,8 @@ def load_robomimic(
         TensorDict: the memory-mapped transitions, ``[T]``.
 
     Raises:
-        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        FileExistsError: ``path`` exists, was not written by an equal call, and
+            ``overwrite`` is ``False``.
         FileNotFoundError: there is no such file.
         ImportError: the package ``h5py`` is missing.
         KeyError: the file or a demonstration lacks an entry; the message lists what is
@@ -153,7 +152,6 @@ def load_robomimic(
             f"keys={list(keys)} joins entries to a flat observation, so it must have "
             "at least one, and images= and exclude= do not apply: leave these out"
         )
-    check_free(path, overwrite)
     file = Path(file)
     with _opened(h5py, file) as stored:
         demos = _demos(stored, file, mask)
@@ -177,20 +175,24 @@ def load_robomimic(
             "columns": columns,
             **{name: value for name, value in options._asdict().items() if value},
         }
-        with TransitionWriter(
-            path, overwrite=overwrite, action_bounds=action_bounds, source=source
-        ) as writer:
-            bar = tqdm(
-                demos,
-                desc=f"loading {file.name}",
-                unit="episode",
-                disable=not progress,
-            )
-            for name in bar:
-                where = f"{name} of {file}"
-                rows = _transitions(stored["data"][name], file, where, options)
-                writer.add(rows, where=where)
-    return load_transitions(path)
+        return write_episodes(
+            _parts(stored["data"], demos, file, options),
+            path,
+            source=source,
+            action_bounds=action_bounds,
+            overwrite=overwrite,
+            progress=progress,
+            total=len(demos),
+            description=f"loading {file.name}",
+        )
+
+
+def _parts(
+    data: Any, demos: Sequence[str], file: Path, options: _Options
+) -> Iterator[Part]:
+    for name in demos:
+        where = f"{name} of {file}"
+        yield Part(_transitions(data[name], file, where, options), where)
 
 
 def _h5py() -> Any:

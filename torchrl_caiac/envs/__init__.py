@@ -35,6 +35,7 @@ from torchrl_caiac.envs.kitchen import (
     load_d4rl_kitchen,
     make_kitchen_env,
 )
+from torchrl_caiac.envs.random_transitions import RestorableEnv, random_transitions
 
 __all__ = [
     "FETCH_PUSH_ENV_ID",
@@ -50,6 +51,7 @@ __all__ = [
     "KitchenState",
     "KitchenTruth",
     "RenderingUnavailable",
+    "RestorableEnv",
     "create_fetch_push_expert",
     "create_fetch_push_random",
     "create_kitchen_demonstrations",
@@ -63,4 +65,5 @@ __all__ = [
     "load_d4rl_kitchen",
     "make_fetch_push_env",
     "make_kitchen_env",
+    "random_transitions",
 ]

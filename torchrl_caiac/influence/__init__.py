@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_caiac.influence.action_coverage import ActionCoverage, action_coverage
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.distance import DistanceInfluence
@@ -13,6 +14,7 @@ from torchrl_caiac.influence.metrics import (
 )
 from torchrl_caiac.influence.mixture_divergence import causal_action_influence
 from torchrl_caiac.influence.motion import MotionInfluence
+from torchrl_caiac.influence.residual import ResidualInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
@@ -29,14 +31,17 @@ from torchrl_caiac.influence.truth import (
 
 __all__ = [
     "CAI",
+    "ActionCoverage",
     "AttentionInfluence",
     "DistanceInfluence",
     "EntityReport",
     "MotionInfluence",
+    "ResidualInfluence",
     "ScoreOnWrite",
     "SimulatorInfluence",
     "ThresholdSuggestions",
     "TrueInfluence",
+    "action_coverage",
     "best_threshold",
     "causal_action_influence",
     "influence_report",

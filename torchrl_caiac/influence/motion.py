@@ -156,16 +156,11 @@ class MotionInfluence(nn.Module):
             RuntimeError: the tolerances are unknown.
             ValueError: a state or a next state is not finite.
         """
-        if self.tolerance is None:
-            raise RuntimeError(
-                "the tolerances of MotionInfluence are unknown: call fit(data) first, "
-                "or pass tolerance="
-            )
         now = self.layout.read(tensordict)
         after = self.layout.read(tensordict, next=True)
-        change = (after - now).abs()
-        index, limit, owner = self._columns(change, tensordict)
-        ratio = (change[..., index] / limit).float()
+        index, limit, owner = self.columns(now, tensordict)
+        change = (after - now)[..., index] - self.expected_change(now)
+        ratio = (change.abs() / limit).float()
         score = ratio.new_zeros((*ratio.shape[:-1], len(self.layout)))
         score = score.scatter_reduce(-1, owner.expand(ratio.shape), ratio, "amax")
         if not bool(score.isfinite().all()):
@@ -177,13 +172,43 @@ class MotionInfluence(nn.Module):
             )
         return torch.where(score > 1, score, 0)
 
-    def _columns(
-        self, change: torch.Tensor, td: TensorDictBase
+    def expected_change(self, state: torch.Tensor) -> torch.Tensor | float:
+        """Returns how the positions change if nothing influences the entities.
+
+        Args:
+            state (torch.Tensor): the features of all entities, ``[*B, W]``.
+
+        Returns:
+            torch.Tensor or float: ``[*B, P]``, the position columns of all entities in
+            layout order; here 0.
+        """
+        return 0.0
+
+    def columns(
+        self, state: torch.Tensor, td: TensorDictBase
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Returns the features to read, their tolerances and their entities."""
-        key = (change.device, change.shape[-1])
+        """Returns the position columns of all entities, ``[P]``.
+
+        Args:
+            state (torch.Tensor): the features of all entities, ``[*B, W]``.
+            td (TensorDictBase): the transitions that they were read from.
+
+        Returns:
+            tuple of torch.Tensor: their places in the features, their tolerances, and
+            the numbers of their entities, in layout order.
+
+        Raises:
+            RuntimeError: the tolerances are unknown.
+            ValueError: the number of tolerances of an entity is not that of its
+                features.
+        """
+        if self.tolerance is None:
+            raise RuntimeError(
+                "the tolerances of MotionInfluence are unknown: call fit(data) first, "
+                "or pass tolerance="
+            )
+        key = (state.device, state.shape[-1])
         if key not in self._limits:
-            assert self.tolerance is not None
             index: list[int] = []
             limit: list[float] = []
             owner: list[int] = []
@@ -201,9 +226,9 @@ class MotionInfluence(nn.Module):
                 limit += [values[feature] for feature in own]
                 owner += [number] * len(own)
             self._limits[key] = [
-                torch.tensor(index, device=change.device),
-                torch.tensor(limit, dtype=change.dtype, device=change.device),
-                torch.tensor(owner, device=change.device),
+                torch.tensor(index, device=state.device),
+                torch.tensor(limit, dtype=state.dtype, device=state.device),
+                torch.tensor(owner, device=state.device),
             ]
         index_, limit_, owner_ = self._limits[key]
         return index_, limit_, owner_

@@ -1,15 +1,17 @@
-"""Checks of the arguments that say which columns a world model predicts."""
+"""Checks of the arguments that say which columns a world model reads and predicts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["checked_floor", "checked_predict", "checked_widths", "layout_floor"]
-
-# 1 mm, 1 mrad.
-_DEFAULT_FLOOR = 1e-3
+__all__ = [
+    "checked_inputs",
+    "checked_predict",
+    "checked_widths",
+    "named_columns",
+]
 
 
 def checked_widths(
@@ -85,105 +87,97 @@ def checked_predict(
         >>> checked_predict(layout, layout.widths(), {"cup": [3]})
         {'arm': (0, 1), 'cup': (1,)}
     """
-    predict = {} if predict is None else predict
-    unknown = [name for name in predict if name not in layout.names]
-    if unknown:
-        raise ValueError(
-            f"predict names {unknown}, which are not entities of this layout: expected "
-            f"some of {list(layout.names)}"
-        )
-    positions: dict[str, tuple[int, ...]] = {}
-    for name in layout.names:
-        own = layout.columns[name] if layout.is_flat else tuple(range(widths[name]))
-        columns = tuple(predict.get(name, own))
-        foreign = [column for column in columns if column not in own]
-        if foreign or len(set(columns)) != len(columns):
-            what = f"{foreign}, which it does not own" if foreign else f"{columns}"
-            raise ValueError(
-                f"predict gives entity {name!r} the columns {what}: name each of its "
-                f"columns {list(own)} at most once"
-            )
-        positions[name] = tuple(own.index(column) for column in columns)
+    positions = _positions(layout, widths, predict, "predict")
     if not any(positions.values()):
         raise ValueError("predict leaves nothing to predict: give some columns")
     return positions
 
 
-def layout_floor(
-    layout: EntityLayout, predict: Mapping[str, tuple[int, ...]]
-) -> float | dict[str, float | Sequence[float]]:
-    """Returns the variance floor that a layout has for the predicted columns.
+def checked_inputs(
+    layout: EntityLayout,
+    widths: Mapping[str, int],
+    inputs: Mapping[str, Iterable[int]] | None,
+) -> dict[str, tuple[int, ...]]:
+    """Returns the positions to read in the features of each entity.
 
     Args:
         layout (EntityLayout): the entities.
-        predict (Mapping of str to tuple of int): the output of
-            :func:`checked_predict`.
+        widths (Mapping of str to int): the number of features of each entity.
+        inputs (Mapping of str to iterable of int, optional): the argument of the
+            model.
 
     Returns:
-        float or dict of str to float or sequence of float: the floors, 1e-3 if the
-        layout has none.
+        dict of str to tuple of int: one tuple for each entity, in layout order.
+
+    Raises:
+        ValueError: a column is not the entity's, is given twice, or none is left.
 
     Examples:
         >>> from torchrl_caiac import EntityLayout
-        >>> from torchrl_caiac.modules._predicted_columns import layout_floor
-        >>> layout = EntityLayout({"cup": [2, 3]}, variance_floor={"cup": [0.1, 0.2]})
-        >>> layout_floor(layout, {"cup": (1,)})
-        {'cup': [0.2]}
+        >>> from torchrl_caiac.modules._predicted_columns import checked_inputs
+        >>> layout = EntityLayout({"arm": [0, 1], "cup": [2, 3]})
+        >>> checked_inputs(layout, layout.widths(), {"arm": ()})
+        {'arm': (), 'cup': (0, 1)}
     """
-    if not layout.variance_floor:
-        return _DEFAULT_FLOOR
-    result: dict[str, float | Sequence[float]] = {}
-    for name, positions in predict.items():
-        floor = layout.variance_floor[name]
-        if isinstance(floor, tuple):
-            result[name] = [floor[position] for position in positions]
-        else:
-            result[name] = floor
-    return result
+    positions = _positions(layout, widths, inputs, "inputs")
+    if not any(positions.values()):
+        raise ValueError(
+            "inputs leave no column of the state to read, so that the model would "
+            "predict the same in every state: give some columns"
+        )
+    return positions
 
 
-def checked_floor(
-    floor: float | Mapping[str, float | Sequence[float]],
-    predict: Mapping[str, tuple[int, ...]],
-) -> list[float]:
-    """Returns the variance floor of every predicted column.
+def named_columns(
+    layout: EntityLayout, positions: Mapping[str, tuple[int, ...]]
+) -> dict[str, list[int]]:
+    """Returns the columns at some positions, as the arguments of a model name them.
 
     Args:
-        floor (float or Mapping): the argument of the model, or the output of
-            :func:`layout_floor`.
-        predict (Mapping of str to tuple of int): the output of
-            :func:`checked_predict`.
+        layout (EntityLayout): the entities.
+        positions (Mapping of str to tuple of int): the output of
+            :func:`checked_predict` or :func:`checked_inputs`.
 
     Returns:
-        list of float: one standard deviation for each predicted column.
-
-    Raises:
-        ValueError: a floor is missing, negative or not finite.
+        dict of str to list of int: columns of the observation for flat layouts, the
+        positions themselves for nested ones.
 
     Examples:
-        >>> from torchrl_caiac.modules._predicted_columns import checked_floor
-        >>> checked_floor({"arm": 0.1, "cup": [0.2, 0.3]}, {"arm": (0,), "cup": (0, 1)})
-        [0.1, 0.2, 0.3]
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules._predicted_columns import named_columns
+        >>> named_columns(EntityLayout({"arm": [0, 3]}), {"arm": (1,)})
+        {'arm': [3]}
     """
-    if isinstance(floor, Mapping):
-        wanted = [name for name, positions in predict.items() if positions]
-        if set(floor) - set(predict) or set(wanted) - set(floor):
+    columns = layout.columns
+    return {
+        name: [columns[name][p] for p in places] if layout.is_flat else list(places)
+        for name, places in positions.items()
+    }
+
+
+def _positions(
+    layout: EntityLayout,
+    widths: Mapping[str, int],
+    given: Mapping[str, Iterable[int]] | None,
+    argument: str,
+) -> dict[str, tuple[int, ...]]:
+    given = {} if given is None else given
+    unknown = [name for name in given if name not in layout.names]
+    if unknown:
+        raise ValueError(
+            f"{argument} names {unknown}, which are not entities of this layout: "
+            f"expected some of {list(layout.names)}"
+        )
+    positions: dict[str, tuple[int, ...]] = {}
+    for name in layout.names:
+        own = layout.columns[name] if layout.is_flat else tuple(range(widths[name]))
+        columns = tuple(given.get(name, own))
+        foreign = [column for column in columns if column not in own]
+        if foreign or len(set(columns)) != len(columns):
+            what = f"{foreign}, which it does not own" if foreign else f"{columns}"
             raise ValueError(
-                f"variance_floor names {sorted(floor)}, expected the predicted "
-                f"entities {wanted}: give each its own floor, or one float for all"
+                f"{argument} gives entity {name!r} the columns {what}: name each of "
+                f"its columns {list(own)} at most once"
             )
-        per_entity = {name: floor[name] for name in wanted}
-    else:
-        per_entity = {name: floor for name, positions in predict.items() if positions}
-    floors: list[float] = []
-    for name, value in per_entity.items():
-        count = len(predict[name])
-        values = list(value) if isinstance(value, Sequence) else [value] * count
-        if len(values) != count or any(not 0 <= v < float("inf") for v in values):
-            raise ValueError(
-                f"variance_floor of entity {name!r} is {value!r}, expected a standard "
-                "deviation in physical units, at least 0, or one for each of its "
-                f"{count} predicted columns"
-            )
-        floors += [float(v) for v in values]
-    return floors
+        positions[name] = tuple(own.index(column) for column in columns)
+    return positions

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -14,24 +13,32 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_caiac._keys import as_key, floating, jsonable, key_from_json
+from torchrl_caiac._keys import as_key, floating, jsonable
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules._finite import FiniteChecks, owner
 from torchrl_caiac.modules._predicted_columns import (
-    checked_floor,
+    checked_inputs,
     checked_predict,
     checked_widths,
+    named_columns,
+)
+from torchrl_caiac.modules._saved_model import SavedModel
+from torchrl_caiac.modules._variance_floor import (
+    FloorFromData,
+    VarianceFloor,
+    checked_floor,
     layout_floor,
 )
 from torchrl_caiac.modules.running_norm import RunningNorm
 
 __all__ = ["EntityDynamicsModel", "evaluating"]
 
-_Model = TypeVar("_Model", bound="EntityDynamicsModel")
-
 _STATISTICS_ROWS = 65_536  # rows read at once for the statistics of the targets
 
 
-class EntityDynamicsModel(TensorDictModuleBase):
+class EntityDynamicsModel(
+    FiniteChecks, FloorFromData, SavedModel, TensorDictModuleBase
+):
     r"""The base class of models that predict how an action moves every entity.
 
     A model reads the features of all ``N`` entities (``W`` numbers,
@@ -40,9 +47,9 @@ class EntityDynamicsModel(TensorDictModuleBase):
     ``forward_tensors(state, action)`` returns a tuple of the tensors under
     :attr:`out_keys`, the expectation of the normalised target first;
     ``nll(prediction, target)`` returns what
-    :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises. They normalise
-    their inputs with ``state_norm`` and ``action_norm``, and add their own arguments
-    to :attr:`config`.
+    :class:`~torchrl_caiac.objectives.EntityDynamicsLoss` minimises. They read the
+    state by :meth:`read_inputs` and normalise the action by ``action_norm``, and add
+    their own arguments to :attr:`config`.
 
     The *normalised target* is by default the change of each column over the step,
     divided by its standard deviation in the data, or by the floor if that is larger.
@@ -63,10 +70,15 @@ class EntityDynamicsModel(TensorDictModuleBase):
         out_keys (sequence of NestedKey): where the prediction is written.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping, optional): the smallest standard deviation to
-            divide targets by, in the units of the data. One number, or for each entity
-            one number or one for each predicted column. Defaults to that of the layout,
-            or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        variance_floor (float, Mapping or "auto", optional): the smallest standard
+            deviation to divide targets by, in the units of the data. One number, or for
+            each entity one number or one for each predicted column. ``"auto"`` takes it
+            from the data, see :meth:`fit_variance_floor`. Defaults to that of the
+            layout, or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        inputs (Mapping of str to iterable of int, optional): the columns of some
+            entities that the model reads, named as those of ``predict``; all columns of
+            the others are read. ``()`` leaves an entity out. The columns to predict,
+            and those that are swapped, are not affected. Defaults to all columns.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -75,6 +87,10 @@ class EntityDynamicsModel(TensorDictModuleBase):
         action_low (torch.Tensor): float32 ``[A]``, the lowest action, as recorded by
             :meth:`set_action_bounds`; NaN if unknown.
         action_high (torch.Tensor): float32 ``[A]``, the highest action.
+        floor (torch.Tensor): float64 ``[P]``, the variance floor; NaN until it is
+            taken from data.
+        floor_reasons (dict of str to str): how the floor of each entity was taken from
+            data; empty if it was given.
 
     Raises:
         ValueError: an argument does not fit the layout.
@@ -86,9 +102,9 @@ class EntityDynamicsModel(TensorDictModuleBase):
         >>> class Linear(EntityDynamicsModel):
         ...     def __init__(self, layout, action_dim):
         ...         super().__init__(layout, action_dim, out_keys=["change"])
-        ...         self.map = torch.nn.Linear(self.state_dim, self.predict_dim)
+        ...         self.map = torch.nn.Linear(self.input_dim, self.predict_dim)
         ...     def forward_tensors(self, state, action):
-        ...         return (self.map(self.state_norm(state)),)
+        ...         return (self.map(self.read_inputs(state)),)
         ...     def nll(self, prediction, target):
         ...         return (prediction[0] - target).square().mean(-1)
         >>> model = Linear(EntityLayout({"arm": [0, 1], "cup": [2]}), 2)
@@ -108,7 +124,8 @@ class EntityDynamicsModel(TensorDictModuleBase):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey],
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        variance_floor: VarianceFloor = None,
+        inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(action_dim, int) or action_dim < 1:
@@ -127,25 +144,34 @@ class EntityDynamicsModel(TensorDictModuleBase):
 
         self.widths = checked_widths(layout, widths)
         self.predict = checked_predict(layout, self.widths, predict)
+        self.input_positions = checked_inputs(layout, self.widths, inputs)
         if variance_floor is None:
             variance_floor = layout_floor(layout, self.predict)
+        self.auto_floor = isinstance(variance_floor, str)
+        self.floor_reasons: dict[str, str] = {}
         floor = checked_floor(variance_floor, self.predict)
         self.slices: dict[str, slice] = {}
         self.predicted: dict[str, slice] = {}
         start = stop = 0
         index: list[int] = []
+        read: list[int] = []
         for name, positions in self.predict.items():
             self.slices[name] = slice(start, start + self.widths[name])
             index += [start + position for position in positions]
+            read += [start + position for position in self.input_positions[name]]
             start += self.widths[name]
             if positions:
                 self.predicted[name] = slice(stop, stop + len(positions))
                 stop += len(positions)
         self.state_dim, self.predict_dim = start, stop
+        self.input_dim = len(read)
+        self._reads_all = read == list(range(start))
 
-        self.state_norm = RunningNorm(self.state_dim)
+        self.state_norm = RunningNorm(self.input_dim)
         self.action_norm = RunningNorm(action_dim)
         self.index: torch.Tensor
+        self.input_index: torch.Tensor
+        self.register_buffer("input_index", torch.tensor(read), persistent=False)
         self.floor: torch.Tensor
         self.target_loc: torch.Tensor
         self.target_scale: torch.Tensor
@@ -187,6 +213,31 @@ class EntityDynamicsModel(TensorDictModuleBase):
         """
         raise NotImplementedError(f"{type(self).__name__} has no forward_tensors")
 
+    def select_inputs(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns the columns that the model reads, not normalised.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+
+        Returns:
+            torch.Tensor: ``[*B, I]``, entities in layout order; ``I`` is
+            ``input_dim``.
+        """
+        return state if self._reads_all else state[..., self.input_index]
+
+    def read_inputs(self, state: torch.Tensor) -> torch.Tensor:
+        """Returns the normalised columns that the model reads.
+
+        In training mode, they enter the statistics of the normalisation.
+
+        Args:
+            state (torch.Tensor): the entities' features ``[*B, W]``.
+
+        Returns:
+            torch.Tensor: ``[*B, I]``.
+        """
+        return self.state_norm(self.select_inputs(state))
+
     def nll(
         self, prediction: tuple[torch.Tensor, ...], target: torch.Tensor
     ) -> torch.Tensor:
@@ -200,6 +251,23 @@ class EntityDynamicsModel(TensorDictModuleBase):
             torch.Tensor: in nats per column, ``[*B]``.
         """
         raise NotImplementedError(f"{type(self).__name__} has no nll")
+
+    def constant_prediction(
+        self, mean: torch.Tensor, var: torch.Tensor
+    ) -> tuple[torch.Tensor, ...] | None:
+        """Returns the prediction that targets have one mean and variance everywhere.
+
+        :func:`~torchrl_caiac.fit.fit_world_model` warns if a model is no better.
+
+        Args:
+            mean (torch.Tensor): the mean of the normalised targets, ``[P]``.
+            var (torch.Tensor): their variance, ``[P]``.
+
+        Returns:
+            tuple of torch.Tensor: what :meth:`nll` reads; ``None`` (the default) if
+            the model has no such prediction.
+        """
+        return None
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -327,15 +395,28 @@ class EntityDynamicsModel(TensorDictModuleBase):
         """Sets the scale (and for absolute targets the centre) of the targets.
 
         The scale of a predicted column is the standard deviation of its raw target, or
-        its floor if that is larger.
+        its floor if that is larger. With ``variance_floor="auto"``, the floor is first
+        taken from the data, unless it is known.
 
         Args:
             data (TensorDictBase, torch.Tensor or iterable of them): transitions
                 ``[T]``, which are read in chunks, or raw targets ``[T, P]``.
 
         Raises:
-            ValueError: the data are empty, or a value is not finite.
+            ValueError: the data are empty, or a value is not finite; the floor is not
+                known and the data are not transitions.
         """
+        if not self.has_floor:
+            whole = [data] if isinstance(data, TensorDictBase) else data
+            if not isinstance(whole, Sequence) or any(
+                not isinstance(part, TensorDictBase) for part in whole
+            ):
+                raise ValueError(
+                    "variance_floor='auto' needs transitions to read the floor from: "
+                    "pass them, or a list of them, or call fit_variance_floor first"
+                )
+            self.fit_variance_floor(whole)
+            data = whole
         stats = RunningNorm(self.predict_dim).to(self.target_loc.device)
         for raw in self._raw_chunks(data):
             stats.update(raw)
@@ -343,7 +424,7 @@ class EntityDynamicsModel(TensorDictModuleBase):
             raise ValueError("the data are empty: give some transitions")
         if not bool(torch.isfinite(stats.var).all()):
             bad = (~torch.isfinite(stats.var)).nonzero()[0].item()
-            name = self._owner(self.predicted, int(bad))
+            name = owner(self.predicted, int(bad))
             raise ValueError(
                 f"the targets of entity {name!r} are not finite: remove transitions "
                 "with NaN or infinite observations"
@@ -415,59 +496,6 @@ class EntityDynamicsModel(TensorDictModuleBase):
                 td = rows[start : start + _STATISTICS_ROWS].to(device)
                 yield self.raw_targets(layout.read(td), layout.read(td, next=True))
 
-    def check_finite(
-        self, state: torch.Tensor, *, next: bool = False, first_row: int = 0
-    ) -> None:
-        """Raises an error that names entity and row if a state is not finite.
-
-        Args:
-            state (torch.Tensor): the entities' features ``[*B, W]``.
-
-        Keyword Args:
-            next (bool): whether these are next states. Defaults to ``False``.
-            first_row (int): the number of the first row. Defaults to ``0``.
-
-        Raises:
-            ValueError: a value is not finite.
-        """
-        found = _first_non_finite(state)
-        if found is None:
-            return
-        row, column, value, count = found
-        name = self._owner(self.slices, column)
-        key: Any = self.layout.observation_key or self.layout.keys[name]
-        key = self.layout.next(key) if next else key
-        raise ValueError(
-            f"{key!r} is {value} for entity {name!r} in row {first_row + row} "
-            f"({count} such rows), expected finite observations: remove or repair "
-            "these rows"
-        )
-
-    def check_finite_action(self, action: torch.Tensor, *, first_row: int = 0) -> None:
-        """Raises an error that names the row if an action is not finite.
-
-        Args:
-            action (torch.Tensor): ``[*B, A]``.
-
-        Keyword Args:
-            first_row (int): the number of the first row. Defaults to ``0``.
-
-        Raises:
-            ValueError: a value is not finite.
-        """
-        found = _first_non_finite(action)
-        if found is not None:
-            row, column, value, count = found
-            raise ValueError(
-                f"{self.action_key!r} is {value} in column {column} of row "
-                f"{first_row + row} ({count} such rows), expected finite actions: "
-                "remove or repair these rows"
-            )
-
-    @staticmethod
-    def _owner(slices: Mapping[str, slice], column: int) -> str:
-        return next(n for n, s in slices.items() if s.start <= column < s.stop)
-
     def _check_fitted(self) -> None:
         if not self.fitted:
             raise RuntimeError(
@@ -480,90 +508,20 @@ class EntityDynamicsModel(TensorDictModuleBase):
     @property
     def config(self) -> dict[str, Any]:
         """The class of the model and its arguments, JSON-compatible."""
-        floor = self.floor.tolist()
-        return {
+        config: dict[str, Any] = {
             "class": type(self).__name__,
             "layout": self.layout.to_dict(),
             "action_dim": self.action_dim,
             "widths": dict(self.widths),
-            "predict": {n: list(c) for n, c in self._predict_columns().items()},
+            "predict": named_columns(self.layout, self.predict),
             "action_key": jsonable(self.action_key),
             "out_keys": [jsonable(key) for key in self.out_keys],
             "target": self.target,
-            "variance_floor": {n: floor[s] for n, s in self.predicted.items()},
+            "variance_floor": "auto" if self.auto_floor else self.entity_floors(),
         }
-
-    @classmethod
-    def from_config(cls: type[_Model], config: Mapping[str, Any]) -> _Model:
-        """Creates an untrained model with the arguments of another.
-
-        Args:
-            config (Mapping): the :attr:`config` of a model of this class.
-
-        Returns:
-            EntityDynamicsModel: the model.
-
-        Raises:
-            ValueError: the config is that of another class.
-
-        Examples:
-            >>> from torchrl_caiac import EntityLayout
-            >>> from torchrl_caiac.modules import GaussianWorldModel
-            >>> model = GaussianWorldModel(EntityLayout({"arm": [0, 1]}), 2, (8,))
-            >>> twin = GaussianWorldModel.from_config(model.config)
-            >>> twin.load_state_dict(model.state_dict())
-            <All keys matched successfully>
-        """
-        kwargs = dict(config)
-        named = kwargs.pop("class", None)
-        if named != cls.__name__:
-            raise ValueError(
-                f"expected the config of a {cls.__name__}, got that of a {named}: call "
-                f"{named}.from_config"
-            )
-        kwargs["layout"] = EntityLayout.from_dict(kwargs["layout"])
-        kwargs["action_key"] = key_from_json(kwargs["action_key"])
-        kwargs["out_keys"] = [key_from_json(key) for key in kwargs["out_keys"]]
-        return cls(**kwargs)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Returns the part of ``state_dict`` that is not a tensor."""
-        return {"config": json.dumps(self.config), "fitted": self.fitted}
-
-    def set_extra_state(self, state: Any) -> None:
-        """Restores the output of :meth:`get_extra_state`."""
-        self.fitted = bool(state["fitted"])
-
-    def _load_from_state_dict(
-        self, state_dict: Any, prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        # Compared before any tensor is copied, so that an error changes nothing.
-        extra = state_dict.get(f"{prefix}_extra_state")
-        if extra is not None:
-            found = json.loads(extra["config"])
-            for name, value in json.loads(json.dumps(self.config)).items():
-                if found.get(name) == value:
-                    continue
-                if name == "layout":
-                    found[name] = EntityLayout.from_dict(found[name])
-                    value = self.layout
-                raise ValueError(
-                    f"the saved world model has another {name}, saved:\n"
-                    f"{found.get(name)}\nthis model:\n{value}\nCreate the model with "
-                    f"the saved arguments ({found['class']}.from_config)"
-                )
-            if f"{prefix}action_low" not in state_dict:
-                raise ValueError(
-                    "the saved world model is of an earlier version, which did not "
-                    "record the bounds of the actions: fit it again"
-                )
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    def _predict_columns(self) -> dict[str, tuple[int, ...]]:
-        if not self.layout.is_flat:
-            return self.predict
-        columns = self.layout.columns
-        return {n: tuple(columns[n][p] for p in ps) for n, ps in self.predict.items()}
+        if not self._reads_all:
+            config["inputs"] = named_columns(self.layout, self.input_positions)
+        return config
 
 
 @contextmanager
@@ -576,13 +534,3 @@ def evaluating(module: nn.Module) -> Iterator[None]:
     finally:
         for part, training in modes:
             part.training = training
-
-
-def _first_non_finite(x: torch.Tensor) -> tuple[int, int, float, int] | None:
-    """Returns row, column, value, and the number of such rows; ``None`` if finite."""
-    bad = ~torch.isfinite(x).reshape(-1, x.shape[-1])
-    if not bool(bad.any()):
-        return None
-    row, column = bad.nonzero()[0].tolist()
-    value = x.reshape(-1, x.shape[-1])[row, column].item()
-    return row, column, value, int(bad.any(-1).sum())

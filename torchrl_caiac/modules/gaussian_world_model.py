@@ -15,6 +15,7 @@ from torch.nn.utils import parametrizations
 
 from torchrl_caiac._torchrl import linear_pointwise, packed_weight
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules._variance_floor import VarianceFloor
 from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
     evaluating,
@@ -52,9 +53,10 @@ class GaussianWorldModel(EntityDynamicsModel):
     r"""The transition model ``p(s'_j | s, a)`` of the paper, section 3.2 and A.7.
 
     A multi-layer perceptron (ReLU, orthogonal weights, zero biases) reads the features
-    of all ``N`` entities (``W`` numbers, :meth:`~torchrl_caiac.EntityLayout.read`) and
-    the action (``A``), both normalised by a running mean and variance. Separate heads
-    predict the mean and the variance of a diagonal Gaussian of ``P`` columns.
+    of all ``N`` entities (``W`` numbers, :meth:`~torchrl_caiac.EntityLayout.read`), or
+    the ``inputs`` among them, and the action (``A``), both normalised by a running mean
+    and variance. Separate heads predict the mean and the variance of a diagonal
+    Gaussian of ``P`` columns.
 
     The Gaussian describes the *normalised target*: by default the change of each
     column over the step, divided by its standard deviation in the data, or by the floor
@@ -84,14 +86,22 @@ class GaussianWorldModel(EntityDynamicsModel):
             ``("prediction", "var")``.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping, optional): the smallest standard deviation,
-            in the units of the data, of the data and of a prediction. One number, or
-            for each entity one number or one for each predicted column. Defaults to
-            that of the layout, or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        variance_floor (float, Mapping or "auto", optional): the smallest standard
+            deviation, in the units of the data, of the data and of a prediction. One
+            number, or for each entity one number or one for each predicted column.
+            ``"auto"`` takes it from the noise of entities at rest, see
+            :meth:`~torchrl_caiac.modules.EntityDynamicsModel.fit_variance_floor`.
+            Defaults to that of the layout, or to ``1e-3`` (1 mm, 1 mrad) if it has
+            none.
         spectral_norm (bool): whether to normalise the hidden layers spectrally.
             Defaults to ``False``.
         max_variance (float): the largest variance, in normalised units. Defaults to
             ``200.0``.
+        inputs (Mapping of str to iterable of int, optional): the columns of some
+            entities that the model reads, as in
+            :class:`~torchrl_caiac.modules.EntityDynamicsModel`. A column that does not
+            help to predict, such as a joint angle next to the position of the hand, is
+            one more way to memorise the data. Defaults to all columns.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -134,9 +144,10 @@ class GaussianWorldModel(EntityDynamicsModel):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey] = (("prediction", "loc"), ("prediction", "var")),
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        variance_floor: VarianceFloor = None,
         spectral_norm: bool = False,
         max_variance: float = 200.0,
+        inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         hidden_sizes = tuple(hidden_sizes)
         if not hidden_sizes or any(
@@ -161,11 +172,12 @@ class GaussianWorldModel(EntityDynamicsModel):
             out_keys=out_keys,
             target=target,
             variance_floor=variance_floor,
+            inputs=inputs,
         )
         self.hidden_sizes = hidden_sizes
         self.spectral_norm = bool(spectral_norm)
         self.max_variance = float(max_variance)
-        sizes = [self.state_dim + action_dim, *hidden_sizes]
+        sizes = [self.input_dim + action_dim, *hidden_sizes]
         self.hidden = nn.ModuleList(
             _orthogonal(nn.Linear(n_in, n_out)) for n_in, n_out in pairwise(sizes)
         )
@@ -198,8 +210,8 @@ class GaussianWorldModel(EntityDynamicsModel):
         first: Any = self.hidden[0]
         weight = first.weight
         x = F.linear(
-            self.state_norm(state.to(dtype)), weight[:, : self.state_dim], first.bias
-        ) + F.linear(self.action_norm(action.to(dtype)), weight[:, self.state_dim :])
+            self.read_inputs(state.to(dtype)), weight[:, : self.input_dim], first.bias
+        ) + F.linear(self.action_norm(action.to(dtype)), weight[:, self.input_dim :])
         x = F.relu(x, inplace=True)
         later: Any = self.hidden[1:]
         for layer in later:
@@ -249,7 +261,7 @@ class GaussianWorldModel(EntityDynamicsModel):
             dtype = self.loc_head.weight.dtype
             first: Any = self.hidden[0]
             of_state, of_action = first.weight.split(
-                [self.state_dim, self.action_dim], -1
+                [self.input_dim, self.action_dim], -1
             )
             by_action = F.linear(
                 self.action_norm(actions.to(dtype)), of_action, first.bias
@@ -272,7 +284,7 @@ class GaussianWorldModel(EntityDynamicsModel):
                 raise ValueError(
                     f"expected states [B, {self.state_dim}], got {list(state.shape)}"
                 )
-            state = (state.to(dtype) - shift) * gain
+            state = (self.select_inputs(state).to(dtype) - shift) * gain
             size = (len(state), num_actions, 2 * self.predict_dim)
             out = state.new_empty(size)
             for own_out, own in zip(
@@ -293,6 +305,11 @@ class GaussianWorldModel(EntityDynamicsModel):
         return predict
 
     def _variance_floor(self) -> torch.Tensor:
+        if not self.has_floor:
+            raise RuntimeError(
+                "the variance floor is not known: call model.fit_statistics(data), or "
+                "fit_world_model(model, data), first"
+            )
         return (self.floor / self.target_scale).square() + 1e-8
 
     def nll(
@@ -309,6 +326,21 @@ class GaussianWorldModel(EntityDynamicsModel):
         """
         loc, var = prediction
         return gaussian_nll(loc, var, target)
+
+    def constant_prediction(
+        self, mean: torch.Tensor, var: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Returns the Gaussian of all targets, with the variance floor.
+
+        Args:
+            mean (torch.Tensor): the mean of the normalised targets, ``[P]``.
+            var (torch.Tensor): their variance, ``[P]``.
+
+        Returns:
+            tuple of torch.Tensor: mean and variance, ``[P]`` each.
+        """
+        floor = self._variance_floor().to(var.dtype)
+        return mean, torch.maximum(var, floor).clamp_max(self.max_variance)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -63,8 +63,11 @@ class GoalFeatures(TensorDictModuleBase):
     Keyword Args:
         relative (bool): whether to add the relative features. Defaults to ``True``.
         reference (str, optional): the entity to take positions relative to, such as
-            the gripper. Its first columns are read, as many as an entity has goal
-            columns. Defaults to ``None``, which leaves these features out.
+            the gripper. Defaults to ``None``, which leaves these features out.
+        reference_columns (iterable of int, optional): the observation columns that say
+            where the reference is, in the order of the goal columns of each entity.
+            Defaults to the layout's ``positions`` of the reference or, if there are
+            none, to its first columns, as many as an entity has goal columns.
         floor (float): the smallest standard deviation to divide by, in the units of
             the data. Defaults to ``0.02``.
         out_key (NestedKey): where the features are written, ``[*B, F]``. Defaults to
@@ -74,8 +77,9 @@ class GoalFeatures(TensorDictModuleBase):
         norm (RunningNorm): the normalisation of the features.
 
     Raises:
-        ValueError: the layout is nested or has no goals, the reference does not fit
-            it, or the floor is not positive.
+        ValueError: the layout is nested or has no goals; the reference or its columns
+            do not fit it; an entity has another number of goal columns than the
+            reference has positions; the floor is not positive.
 
     Examples:
         >>> import torch
@@ -105,6 +109,7 @@ class GoalFeatures(TensorDictModuleBase):
         *,
         relative: bool = True,
         reference: str | None = None,
+        reference_columns: Iterable[int] | None = None,
         floor: float = 0.02,
         out_key: NestedKey = "features",
     ) -> None:
@@ -121,6 +126,11 @@ class GoalFeatures(TensorDictModuleBase):
                 f"reference={reference!r} is used by relative features only: leave it "
                 "out, or give relative=True"
             )
+        if reference_columns is not None and reference is None:
+            raise ValueError(
+                "reference_columns are columns of the reference: name it, "
+                "reference=..., or leave them out"
+            )
         self.layout = layout
         self.relative = relative
         self.reference = reference
@@ -131,7 +141,9 @@ class GoalFeatures(TensorDictModuleBase):
             mirrored = _by_goal_column(layout, dict(layout.achieved))
             self._columns["achieved"] = mirrored
         if reference is not None:
-            self._columns["reference"] = _reference_columns(layout, reference)
+            self._columns["reference"] = _reference_columns(
+                layout, reference, reference_columns
+            )
         self._whole = self._columns["state"] == list(range(self.state_dim))
         self._tensors: dict[tuple[str, torch.device], torch.Tensor] = {}
         blocks = 1 + relative + (reference is not None)
@@ -279,20 +291,34 @@ def _by_goal_column(
     return [column for _, column in sorted(pairs)]
 
 
-def _reference_columns(layout: EntityLayout, reference: str) -> list[int]:
+def _reference_columns(
+    layout: EntityLayout, reference: str, given: Iterable[int] | None
+) -> list[int]:
     if reference not in layout.names:
         raise ValueError(
             f"reference is {reference!r}, which is not an entity of this layout: "
             f"expected one of {list(layout.names)}"
         )
-    position = layout.columns[reference]
+    own = layout.columns[reference]
+    position = layout.positions.get(reference) if given is None else tuple(given)
+    first = position is None  # of which any entity takes as many as it needs
+    position = own if position is None else position
+    foreign = [column for column in position if column not in own]
+    if foreign or len(set(position)) != len(position):
+        raise ValueError(
+            f"reference_columns are {list(position)}, expected columns of "
+            f"{reference!r}, each at most once: some of {list(own)}"
+        )
     columns = {}
     for name, goal in layout.goal.items():
-        if len(goal) > len(position):
+        fits = len(goal) <= len(position) if first else len(goal) == len(position)
+        if goal and not fits:
             raise ValueError(
                 f"entity {name!r} has {len(goal)} goal columns, but the reference "
-                f"{reference!r} has only {len(position)} columns to take its position "
-                "from: name another reference, or None"
+                f"{reference!r} has {'only ' if first else ''}{len(position)} columns "
+                f"{list(position)} to take its position from: give reference_columns, "
+                "as many as each entity has goal columns, name another reference, or "
+                "None"
             )
         columns[name] = position[: len(goal)]
     return _by_goal_column(layout, columns)

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules._variance_floor import VarianceFloor
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 
 __all__ = ["TransformerWorldModel"]
@@ -53,10 +54,14 @@ class TransformerWorldModel(EntityDynamicsModel):
             written. Defaults to ``("prediction", "loc")``.
         target (str): ``"change"`` (next minus current state) or ``"absolute"`` (the
             next state, centred). Defaults to ``"change"``.
-        variance_floor (float or Mapping, optional): the smallest standard deviation to
-            divide targets by, in the units of the data. One number, or for each entity
-            one number or one for each predicted column. Defaults to that of the layout,
-            or to ``1e-3`` (1 mm, 1 mrad) if it has none.
+        variance_floor (float, Mapping or "auto", optional): the smallest standard
+            deviation to divide targets by, in the units of the data, as in
+            :class:`EntityDynamicsModel`. Defaults to that of the layout, or to ``1e-3``
+            (1 mm, 1 mrad) if it has none.
+        inputs (Mapping of str to iterable of int, optional): the columns of some
+            entities that their tokens are projected from, as in
+            :class:`EntityDynamicsModel`, at least one of each entity. Defaults to all
+            columns.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
@@ -96,7 +101,8 @@ class TransformerWorldModel(EntityDynamicsModel):
         action_key: NestedKey = "action",
         out_keys: Sequence[NestedKey] = (("prediction", "loc"),),
         target: Literal["change", "absolute"] = "change",
-        variance_floor: float | Mapping[str, float | Sequence[float]] | None = None,
+        variance_floor: VarianceFloor = None,
+        inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         feedforward = width if feedforward is None else feedforward
         for name, value in (
@@ -127,13 +133,21 @@ class TransformerWorldModel(EntityDynamicsModel):
             out_keys=out_keys,
             target=target,
             variance_floor=variance_floor,
+            inputs=inputs,
         )
+        empty = [name for name, own in self.input_positions.items() if not own]
+        if empty:
+            raise ValueError(
+                f"inputs give {empty} no columns, so that their tokens would say "
+                "nothing of the state: give each entity at least one column"
+            )
+        self._sizes = [len(own) for own in self.input_positions.values()]
         self.heads = heads
         self.width = width
         self.feedforward = feedforward
         self.dropout = float(dropout)
         self.inputs = nn.ModuleList(
-            nn.Linear(size, width) for size in (*self.widths.values(), action_dim)
+            nn.Linear(size, width) for size in (*self._sizes, action_dim)
         )
         # Not nn.TransformerEncoder: all of its layers start with the same weights.
         self.layers = nn.ModuleList(
@@ -185,6 +199,20 @@ class TransformerWorldModel(EntityDynamicsModel):
         """
         return 0.5 * (target - prediction[0]).square().mean(-1)
 
+    def constant_prediction(
+        self, mean: torch.Tensor, var: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Returns the mean of all targets, since the model predicts no variance.
+
+        Args:
+            mean (torch.Tensor): the mean of the normalised targets, ``[P]``.
+            var (torch.Tensor): their variance, ``[P]``, not used.
+
+        Returns:
+            tuple of torch.Tensor: the mean.
+        """
+        return (mean,)
+
     def attention(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Returns the attention matrices of all layers, averaged over the heads.
 
@@ -218,10 +246,10 @@ class TransformerWorldModel(EntityDynamicsModel):
         self._check_widths(state, action)
         last: Any = self.inputs[-1]
         dtype = last.weight.dtype
-        state = self.state_norm(state.to(dtype))
+        state = self.read_inputs(state.to(dtype))
         action = self.action_norm(action.to(dtype))
         batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
-        parts = [*state.split(list(self.widths.values()), -1), action]
+        parts = [*state.split(self._sizes, -1), action]
         tokens = [
             project(part).expand(*batch, self.width)
             for project, part in zip(self.inputs, parts, strict=True)

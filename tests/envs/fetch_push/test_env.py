@@ -525,3 +525,40 @@ def _equal(a, b) -> bool:
     if isinstance(a, dict):
         return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
     return np.array_equal(a, b)
+
+
+def test_cubes_slide_by_themselves_with_low_friction() -> None:
+    def way(**options: float) -> np.ndarray:
+        env = FetchPushCubes(2, **options)
+        first, _ = env.reset(seed=0)
+        for _ in range(10):
+            last, *_ = env.step(np.zeros(4))
+        moved = last["achieved_goal"] - first["achieved_goal"]
+        return np.linalg.norm(moved.reshape(2, 3)[:, :2], axis=1)
+
+    # 0.2 m/s for 0.4 s, and g * 0.02 / 2 * 0.4^2 less of it.
+    np.testing.assert_allclose(
+        way(cube_friction=0.02, cube_speed=0.2), 0.065, atol=4e-3
+    )
+    assert (way(cube_speed=0.2) < 0.01).all()
+    assert (way() < 1e-4).all()
+
+
+def test_sliding_cubes_do_not_change_the_draws() -> None:
+    plain, _ = FetchPushCubes(2).reset(seed=3)
+    slippery, _ = FetchPushCubes(2, cube_friction=0.02).reset(seed=3)
+    np.testing.assert_allclose(
+        plain["observation"][10:13], slippery["observation"][10:13], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cube_friction": 0.0}, "cube_friction is 0.0, expected None or a positive"),
+        ({"cube_speed": -1.0}, "cube_speed is -1.0, expected between 0 and 0.5"),
+    ],
+)
+def test_impossible_cubes_are_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FetchPushCubes(2, **options)

@@ -13,6 +13,7 @@ from torchrl_caiac.envs.fetch_push.registration import (
     make_fetch_push_env,
     register_fetch_push,
 )
+from torchrl_caiac.envs.fetch_push.restorable import RestorableFetchPush
 from torchrl_caiac.envs.fetch_push.task import (
     fetch_push_distances,
     fetch_push_layout,
@@ -26,6 +27,7 @@ __all__ = [
     "FetchPushExpert",
     "FetchPushState",
     "FetchPushTruth",
+    "RestorableFetchPush",
     "create_fetch_push_expert",
     "create_fetch_push_random",
     "fetch_push_distances",

@@ -51,6 +51,8 @@ def create_fetch_push_expert(
     steps: int = 100,
     action_noise: float = 0.2,
     simulator_states: bool = True,
+    cube_friction: float | None = None,
+    cube_speed: float = 0.0,
     root: str | os.PathLike[str] | None = None,
     work: str | os.PathLike[str] | None = None,
     episodes_per_file: int = 10,
@@ -81,6 +83,9 @@ def create_fetch_push_expert(
             actions, which are in [-1, 1]. Defaults to 0.2.
         simulator_states (bool): if ``True``, the infos contain ``"simulator"``.
             Defaults to ``True``.
+        cube_friction (float, optional): as in
+            :class:`~torchrl_caiac.envs.FetchPushCubes`. Defaults to ``None``.
+        cube_speed (float): the same. Defaults to 0.
         root (path, optional): the folder of Minari datasets. Defaults to
             ``MINARI_DATASETS_PATH`` or Minari's own.
         work (path, optional): a folder for finished episodes, from which an interrupted
@@ -118,7 +123,7 @@ def create_fetch_push_expert(
         raise ValueError(f"action_noise is {action_noise}, expected at least 0")
     return _create(
         dataset_id or f"fetch-push-{num_cubes}/expert-v0",
-        _Policy(_EXPERT, num_cubes, steps, action_noise),
+        _Policy(_EXPERT, num_cubes, steps, action_noise, cube_friction, cube_speed),
         f"A scripted expert with action noise {action_noise:g}",
         "torchrl_caiac scripted expert",
         episodes=episodes,
@@ -140,6 +145,8 @@ def create_fetch_push_random(
     num_cubes: int = 2,
     steps: int = 100,
     simulator_states: bool = True,
+    cube_friction: float | None = None,
+    cube_speed: float = 0.0,
     root: str | os.PathLike[str] | None = None,
     work: str | os.PathLike[str] | None = None,
     episodes_per_file: int = 10,
@@ -162,6 +169,9 @@ def create_fetch_push_random(
         steps (int): the number of steps of an episode. Defaults to 100.
         simulator_states (bool): if ``True``, the infos contain ``"simulator"``.
             Defaults to ``True``.
+        cube_friction (float, optional): as in
+            :class:`~torchrl_caiac.envs.FetchPushCubes`. Defaults to ``None``.
+        cube_speed (float): the same. Defaults to 0.
         root (path, optional): the folder of Minari datasets. Defaults to
             ``MINARI_DATASETS_PATH`` or Minari's own.
         work (path, optional): a folder for finished episodes, from which an interrupted
@@ -193,7 +203,13 @@ def create_fetch_push_random(
     """
     return _create(
         dataset_id or f"fetch-push-{num_cubes}/random-v0",
-        _Policy(_RANDOM, num_cubes, steps),
+        _Policy(
+            _RANDOM,
+            num_cubes,
+            steps,
+            cube_friction=cube_friction,
+            cube_speed=cube_speed,
+        ),
         "Uniformly random actions",
         "uniform random actions",
         episodes=episodes,
@@ -216,6 +232,24 @@ class _Policy:
     num_cubes: int
     steps: int
     action_noise: float = 0.0
+    cube_friction: float | None = None
+    cube_speed: float = 0.0
+
+    def make_env(self) -> FetchPushCubes:
+        arguments: dict[str, Any] = {
+            "num_cubes": self.num_cubes,
+            "max_episode_steps": self.steps,
+        }
+        if self.cube_friction is not None:
+            arguments["cube_friction"] = self.cube_friction
+        if self.cube_speed:
+            arguments["cube_speed"] = self.cube_speed
+        env = FetchPushCubes(**arguments)
+        # Minari recreates the environment from its specification. ``gymnasium.make``
+        # would leave max_episode_steps out of it.
+        spec = gymnasium.spec(FETCH_PUSH_ENV_ID)
+        env.spec = dataclasses.replace(spec, kwargs=arguments)
+        return env
 
 
 def _create(
@@ -253,7 +287,7 @@ def _create(
     ]
     with work_folder(work, dataset_id) as folder:
         report = collect_episodes(
-            functools.partial(_Source, policy.num_cubes, policy.steps),
+            functools.partial(_Source, policy),
             specs,
             folder,
             seed=seed,
@@ -272,7 +306,7 @@ def _create(
             dataset_id,
             (buffer for file in report.files for buffer in _buffers(file)),
             target,
-            lambda: _make_env(policy.num_cubes, policy.steps),
+            policy.make_env,
             code="torchrl_caiac/envs/fetch_push/datasets.py",
             requirements=REQUIREMENTS,
             progress=progress,
@@ -281,20 +315,11 @@ def _create(
         )
 
 
-def _make_env(num_cubes: int, steps: int) -> FetchPushCubes:
-    arguments: dict[str, Any] = {"num_cubes": num_cubes, "max_episode_steps": steps}
-    env = FetchPushCubes(**arguments)
-    # Minari recreates the environment from its specification. ``gymnasium.make`` would
-    # leave max_episode_steps out of it.
-    env.spec = dataclasses.replace(gymnasium.spec(FETCH_PUSH_ENV_ID), kwargs=arguments)
-    return env
-
-
 class _Source:
     """Collects several episodes at a time, stacked ``[M, *]``."""
 
-    def __init__(self, num_cubes: int, steps: int) -> None:
-        self.env = _make_env(num_cubes, steps)
+    def __init__(self, policy: _Policy) -> None:
+        self.env = policy.make_env()
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any]:
         # The two datasets must not share starts and goals, whatever their seeds are.

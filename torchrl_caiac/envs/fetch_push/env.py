@@ -29,6 +29,7 @@ __all__ = ["FetchPushCubes", "FetchPushState"]
 
 _EPISODE_STEPS = 100
 _MAX_GRIPPER_NOISE = 0.1
+_MAX_CUBE_SPEED = 0.5  # m/s
 # The noise of the start along each axis, as a share of ``gripper_noise``.
 _NOISE_SCALE = np.array([1.0, 1.0, 0.3])
 _CAMERA = {
@@ -90,6 +91,12 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
         goal_range (float): the same for goals. Defaults to 0.15.
         gripper_noise (float): the gripper starts up to this far from the centre of the
             table along x and y, in metres, and 0.3 of it in height. Defaults to 0.05.
+        cube_friction (float, optional): the coefficient of sliding friction of the
+            cubes on everything. With a low one, such as 0.02, they slide on by
+            themselves. Defaults to ``None``: that of gymnasium-robotics, with which
+            they stop at once.
+        cube_speed (float): the speed at which cubes start, in random directions, in
+            metres per second. Defaults to 0.
         render_mode (str, optional): ``None`` or ``"rgb_array"``.
         render_size (tuple of int): width and height of rendered frames, in pixels.
             Defaults to ``(320, 240)``.
@@ -141,6 +148,8 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
         cube_range: float = 0.15,
         goal_range: float = 0.15,
         gripper_noise: float = 0.05,
+        cube_friction: float | None = None,
+        cube_speed: float = 0.0,
         render_mode: str | None = None,
         render_size: tuple[int, int] = (320, 240),
     ) -> None:
@@ -162,6 +171,14 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
                 f"gripper_noise is {gripper_noise}, expected between 0 and "
                 f"{_MAX_GRIPPER_NOISE}"
             )
+        if cube_friction is not None and not 0 < cube_friction < np.inf:
+            raise ValueError(
+                f"cube_friction is {cube_friction}, expected None or a positive number"
+            )
+        if not 0 <= cube_speed <= _MAX_CUBE_SPEED:
+            raise ValueError(
+                f"cube_speed is {cube_speed}, expected between 0 and {_MAX_CUBE_SPEED}"
+            )
         #: The entities of the observation and their goal columns.
         self.layout = fetch_push_layout(num_cubes)
         self.num_cubes = num_cubes
@@ -171,10 +188,12 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
         self.cube_range = cube_range
         self.goal_range = goal_range
         self.gripper_noise = gripper_noise
+        self.cube_friction = cube_friction
+        self.cube_speed = cube_speed
         self.render_mode = render_mode
         self.render_size = render_size
         self._renderer: OffscreenRenderer | None = None
-        self._simulator = FetchPushSimulator(num_cubes)
+        self._simulator = FetchPushSimulator(num_cubes, cube_friction)
         self._goal = np.zeros((num_cubes, 3))
         self._steps = 0
         self._ready = False
@@ -254,6 +273,10 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
         if goals is None:
             goals = self._goal_region.draw(rng, own=cubes)
         self._simulator.start(cubes, gripper)
+        if self.cube_speed:
+            angle = rng.uniform(0, 2 * np.pi, self.num_cubes)
+            directions = np.stack([np.cos(angle), np.sin(angle)], 1)
+            self._simulator.push_cubes(self.cube_speed * directions)
         self._set_goal(goals)
         self._steps = 0
         self._ready = True
@@ -491,7 +514,7 @@ class FetchPushCubes(gymnasium.Env[dict[str, Any], Any]):
     @functools.cached_property
     def _other_simulator(self) -> FetchPushSimulator:
         """A simulator for states that are not those of the episode."""
-        return FetchPushSimulator(self.num_cubes)
+        return FetchPushSimulator(self.num_cubes, self.cube_friction)
 
     def _given(
         self, name: str, options: dict[str, Any], *, height_tolerance: float

@@ -87,11 +87,13 @@ class CompiledModel(NamedTuple):
 
 
 @functools.cache
-def compile_model(num_cubes: int) -> CompiledModel:
+def compile_model(num_cubes: int, cube_friction: float | None = None) -> CompiledModel:
     """Builds the model with a number of cubes, once per process.
 
     Args:
         num_cubes (int): the number of cubes.
+        cube_friction (float, optional): the coefficient of sliding friction of the
+            cubes on everything. Defaults to ``None``: that of gymnasium-robotics.
 
     Returns:
         CompiledModel: the model, shared by all simulators of the process.
@@ -101,7 +103,7 @@ def compile_model(num_cubes: int) -> CompiledModel:
         >>> compile_model(2).cube_bodies.shape
         (2,)
     """
-    model = _specification(num_cubes).compile()
+    model = _specification(num_cubes, cube_friction).compile()
     # gymnasium-robotics resets the weld in the same way: the gripper has the pose of
     # the mocap body.
     model.eq_data[0, :7] = [0, 0, 0, 0, 0, 0, 1]
@@ -123,7 +125,7 @@ def compile_model(num_cubes: int) -> CompiledModel:
     return compiled
 
 
-def _specification(num_cubes: int) -> Any:
+def _specification(num_cubes: int, cube_friction: float | None) -> Any:
     packaged = Path(gymnasium_robotics.__file__).parent / "envs/assets/fetch/push.xml"
     spec = mujoco.MjSpec.from_file(str(packaged))
     for body in spec.bodies:
@@ -144,6 +146,9 @@ def _specification(num_cubes: int) -> Any:
             spec.delete(site)
         colour = _COLOURS[i % len(_COLOURS)]
         body.geoms[0].rgba = [*colour, 1.0]
+        if cube_friction is not None:
+            body.geoms[0].friction[0] = cube_friction
+            body.geoms[0].priority = 1  # else the larger friction of the two counts
         # A goal is a body without mass and collisions, and MjData has its position.
         # So all environments can share the model.
         goal = spec.worldbody.add_body(name=f"goal{i}", mocap=True)

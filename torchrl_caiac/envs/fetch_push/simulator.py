@@ -46,10 +46,12 @@ _DIVERGED = (
 class FetchPushSimulator:
     """Simulates the robot and the cubes, without goals, rewards or episodes.
 
-    The simulators of a process that have the same number of cubes share one model.
+    The simulators of a process that have the same cubes share one model.
 
     Args:
         num_cubes (int): the number of cubes ``n``.
+        cube_friction (float, optional): as in
+            :func:`~torchrl_caiac.envs.fetch_push.model.compile_model`.
 
     Examples:
         >>> import numpy as np
@@ -61,9 +63,9 @@ class FetchPushSimulator:
         (22,)
     """
 
-    def __init__(self, num_cubes: int) -> None:
+    def __init__(self, num_cubes: int, cube_friction: float | None = None) -> None:
         self.num_cubes = num_cubes
-        self._compiled = compile_model(num_cubes)
+        self._compiled = compile_model(num_cubes, cube_friction)
         #: The MuJoCo model: shared, do not change it.
         self.model = self._compiled.model
         #: The MuJoCo data.
@@ -103,6 +105,16 @@ class FetchPushSimulator:
         poses[:] = start
         data.qvel[:] = 0.0
         data.qacc_warmstart[:] = 0.0
+        self._refresh()
+
+    def push_cubes(self, velocities: NDArray[np.float64]) -> None:
+        """Sets the velocities of the cubes.
+
+        Args:
+            velocities (NDArray): along x and y ``[n, 2]``, in metres per second.
+        """
+        moving = self.data.qvel[self._compiled.cube_velocity :].reshape(-1, 6)
+        moving[:, :2] = velocities
         self._refresh()
 
     def act(self, action: NDArray[np.float64]) -> None:

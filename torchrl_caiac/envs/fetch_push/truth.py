@@ -32,6 +32,7 @@ class FetchPushTruth:
 
     Args:
         num_cubes (int): the number of cubes ``n``. Defaults to 2.
+        cube_friction (float, optional): that of the environment. Defaults to ``None``.
 
     Examples:
         >>> from torchrl_caiac.envs import FetchPushCubes, FetchPushTruth
@@ -46,7 +47,7 @@ class FetchPushTruth:
         tensor([[ True, False, False]])
     """
 
-    def __init__(self, num_cubes: int = 2) -> None:
+    def __init__(self, num_cubes: int = 2, cube_friction: float | None = None) -> None:
         columns = fetch_push_layout(num_cubes).columns
         #: The positions of the gripper and the cubes.
         self.layout = EntityLayout(
@@ -54,7 +55,7 @@ class FetchPushTruth:
         )
         #: The actions of :class:`FetchPushCubes`.
         self.action_space = Box(-1.0, 1.0, (4,), np.float32)
-        self._simulator = FetchPushSimulator(num_cubes)
+        self._simulator = FetchPushSimulator(num_cubes, cube_friction)
         model = self._simulator.model
         self._cubes = [model.geom(f"object{i}").id for i in range(num_cubes)]
         self._robot = [

@@ -25,6 +25,7 @@ from torchrl_caiac.envs.kitchen.datasets.random_actions import (
     RANDOM_ID,
     create_kitchen_random,
 )
+from torchrl_caiac.envs.kitchen.datasets.restorable import RestorableKitchen
 from torchrl_caiac.envs.kitchen.datasets.transitions import kitchen_transitions
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "PLAY_ORDERS",
     "RANDOM_ID",
     "Demonstrations",
+    "RestorableKitchen",
     "create_kitchen_demonstrations",
     "create_kitchen_play",
     "create_kitchen_random",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
+from torchrl_caiac.data.collect import collect_episodes, load_episode
 from torchrl_caiac.data.minari_checks import episode_lengths
 from torchrl_caiac.data.minari_files import (
     free_dataset_path,
@@ -22,11 +22,11 @@ from torchrl_caiac.data.trees import index_tree, stack_trees
 from torchrl_caiac.envs._requirements import REQUIREMENTS
 from torchrl_caiac.envs.kitchen.datasets.collection import (
     DEFAULT_TASKS,
-    KitchenSource,
     make_franka_kitchen,
 )
 from torchrl_caiac.envs.kitchen.datasets.demonstrations import DEMONSTRATIONS_ID
-from torchrl_caiac.envs.kitchen.starts import set_kitchen_start
+from torchrl_caiac.envs.kitchen.datasets.restorable import RestorableFrankaKitchen
+from torchrl_caiac.envs.random_transitions import keep_array, random_episodes
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -134,13 +134,7 @@ def create_kitchen_random(
     with work_folder(work, dataset_id) as folder:
         folder.mkdir(parents=True, exist_ok=True)
         stored = folder / "states.npy"
-        if not (stored.exists() and _same_array(stored, states)):
-            if (folder / "collection.json").exists():
-                raise ValueError(
-                    f"{folder} contains random actions from other demonstrations; give "
-                    "another folder or delete this one"
-                )
-            np.save(stored, states)
+        keep_array(stored, states)
         report = collect_episodes(
             functools.partial(_RandomSource, str(stored)),
             specs,
@@ -167,33 +161,25 @@ def create_kitchen_random(
     )
 
 
-class _RandomSource(KitchenSource):
+class _RandomSource:
     def __init__(self, states: str) -> None:
-        super().__init__(DEFAULT_TASKS)
+        self.env = RestorableFrankaKitchen()
         # Mapped: an array's header could ask for any amount of memory.
         self.states = np.load(states, mmap_mode="r", allow_pickle=False)
 
     def __call__(self, spec: Mapping[str, Any], seed: int) -> dict[str, Any]:
-        rng = np.random.default_rng([seed, 1])
-        self.env.reset(seed=seed)
-        episodes = []
-        for start in spec["starts"]:
-            # The environment without its wrappers: they count steps over episodes.
-            observation = set_kitchen_start(
-                self.env,
-                qpos=np.array(self.states[start, :30]),
-                qvel=np.array(self.states[start, 30:]),
-            )
-            episodes.append(
-                record_episode(
-                    self.env.unwrapped,
-                    lambda _: rng.uniform(-1.0, 1.0, 9),
-                    observation,
-                    max_steps=spec["steps"],
-                    state=self.simulator_state if spec["simulator_states"] else None,
-                )
-            )
-        return stack_trees(episodes)
+        self.env.seed(seed)
+        episodes = random_episodes(
+            self.env,
+            self.states[spec["starts"]],
+            steps=spec["steps"],
+            rng=np.random.default_rng([seed, 1]),
+            record=spec["simulator_states"],
+        )
+        return stack_trees(list(episodes))
+
+    def close(self) -> None:
+        self.env.close()
 
 
 def _random_buffers(file: Path) -> Iterator[EpisodeBuffer]:
@@ -220,11 +206,3 @@ def _simulator_states(dataset: MinariDataset) -> NDArray[np.float64]:
         both = np.concatenate([infos["qpos"], infos["qvel"]], axis=1)
         states.append(both[: len(episode.actions)])
     return np.concatenate(states)
-
-
-def _same_array(file: Path, array: NDArray[Any]) -> bool:
-    try:
-        stored = np.load(file, mmap_mode="r", allow_pickle=False)
-        return np.array_equal(stored, array)
-    except (OSError, ValueError, EOFError):
-        return False

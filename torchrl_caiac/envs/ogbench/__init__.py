@@ -1,0 +1,17 @@
+"""OGBench's manipulation environments: datasets, simulator and ground truth."""
+
+from __future__ import annotations
+
+from torchrl_caiac.envs.ogbench.datasets import create_ogbench_play
+from torchrl_caiac.envs.ogbench.registration import OGBENCH_ENVS, make_ogbench_env
+from torchrl_caiac.envs.ogbench.simulator import OGBenchSimulator, ogbench_states
+from torchrl_caiac.envs.ogbench.truth import OGBenchTruth
+
+__all__ = [
+    "OGBENCH_ENVS",
+    "OGBenchSimulator",
+    "OGBenchTruth",
+    "create_ogbench_play",
+    "make_ogbench_env",
+    "ogbench_states",
+]

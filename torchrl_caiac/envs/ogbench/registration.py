@@ -1,0 +1,100 @@
+"""OGBench's manipulation environments by name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["OGBENCH_ENVS", "make_ogbench_env"]
+
+#: The names of the environments, without OGBench's version.
+OGBENCH_ENVS = (
+    "cube-single",
+    "cube-double",
+    "cube-triple",
+    "cube-quadruple",
+    "scene",
+    "puzzle-3x3",
+    "puzzle-4x4",
+    "puzzle-4x5",
+    "puzzle-4x6",
+)
+_VERSION = "-v0"
+
+
+def make_ogbench_env(name: str, *, max_episode_steps: int | None = None) -> Any:
+    """Creates an OGBench environment as OGBench collects its datasets.
+
+    Episodes start from random states and do not end at a goal.
+
+    Args:
+        name (str): one of :data:`OGBENCH_ENVS`.
+
+    Keyword Args:
+        max_episode_steps (int, optional): the steps after which an episode is
+            truncated. Defaults to OGBench's number for evaluation.
+
+    Returns:
+        gymnasium.Env: the environment.
+
+    Raises:
+        ValueError: ``name`` is not such an environment.
+        ImportError: ``ogbench`` is not installed, or does not work here.
+
+    Examples:
+        >>> from torchrl_caiac.envs.ogbench import make_ogbench_env
+        >>> env = make_ogbench_env("cube-double")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation.shape, info["qpos"].shape
+        ((37,), (28,))
+        >>> env.close()
+    """
+    check_name(name)
+    gymnasium = _import_ogbench()
+    options: dict[str, Any] = {}
+    if max_episode_steps is not None:
+        options["max_episode_steps"] = max_episode_steps
+    return gymnasium.make(
+        name + _VERSION,
+        terminate_at_goal=False,
+        mode="data_collection",
+        visualize_info=False,
+        # It warns of the bounds of the action space at every step.
+        disable_env_checker=True,
+        **options,
+    )
+
+
+def check_name(name: str) -> None:
+    """Raises if there is no environment of a name.
+
+    Args:
+        name (str): the name.
+
+    Raises:
+        ValueError: ``name`` is not one of :data:`OGBENCH_ENVS`.
+
+    Examples:
+        >>> from torchrl_caiac.envs.ogbench.registration import check_name
+        >>> check_name("scene")
+    """
+    if name not in OGBENCH_ENVS:
+        raise ValueError(
+            f"there is no OGBench environment {name!r}, expected one of "
+            f"{list(OGBENCH_ENVS)}: a dataset's name without '-play-v0' and the like"
+        )
+
+
+def _import_ogbench() -> Any:
+    try:
+        import gymnasium
+        import ogbench.manipspace  # noqa: F401  registers the environments
+    except (ImportError, AttributeError) as error:
+        raise ImportError(
+            f"OGBench's environments could not be imported ({error}): pip install "
+            "'torchrl-caiac[ogbench]', which pins the dm_control that works with it; "
+            "without a display set MUJOCO_GL=egl"
+        ) from error
+    return gymnasium
