@@ -216,14 +216,11 @@ def compare_influence(
     rows = []
     for name, candidate in candidates.items():
         transform = candidate.transform
-        layout, theta, thetas = (
-            transform.layout,
-            transform.threshold,
-            transform.thresholds,
-        )
-        if not thetas:
+        layout, theta = transform.layout, transform.threshold
+        thetas = transform.thresholds
+        if theta == "auto" and not thetas:
             raise ValueError(
-                f"the transform of {name!r} has threshold={theta!r} and no numbers yet: "
+                f"the transform of {name!r} has threshold='auto', and no numbers yet: "
                 "give numbers, such as suggest_thresholds(...).thresholds"
             )
         rb = offline_buffer(data.clone(), batch_size=1)
@@ -294,7 +291,7 @@ def _density(
     fixed = layout.fixed_mask
     # Fixed entities have no threshold of their own, but their links in graphs count:
     # graphs have one threshold for all.
-    some = next(iter(thresholds.values()))
+    some = next(iter(thresholds.values()), 0.0)
     limits = torch.tensor([thresholds.get(name, some) for name in layout.names])
     above = scores > limits.to(scores.device, scores.dtype)
     if scores.ndim == 2:  # without fixed entities, which the action always influences

@@ -21,6 +21,7 @@ from torchrl_caiac._whole_files import whole_file
 from torchrl_caiac.data.offline_buffer import offline_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_record import read_record
+from torchrl_caiac.influence.score_spread import UNKNOWN, score_limits
 from torchrl_caiac.influence.scorer import check_int
 from torchrl_caiac.influence.threshold_motion import (
     SampledRows,
@@ -29,6 +30,7 @@ from torchrl_caiac.influence.threshold_motion import (
     sample_rows,
 )
 from torchrl_caiac.influence.threshold_rule import (
+    DEFAULT_THRESHOLD,
     MOVES,
     Confidence,
     Split,
@@ -39,12 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-__all__ = ["DEFAULT_THRESHOLD", "ThresholdSuggestions", "suggest_thresholds"]
+__all__ = ["ThresholdSuggestions", "suggest_thresholds"]
 
-#: The threshold of :class:`~torchrl_caiac.CAIACTransform`, in nats for CAI.
-DEFAULT_THRESHOLD = 0.05
-# Scores from here on are those of rows whose next states are not stored.
-_UNKNOWN = 1e29
 _CHUNK = 1 << 20
 _BINS = 60
 # The share of the rows about which two scores must agree.
@@ -76,7 +74,7 @@ class ThresholdSuggestions:
         free (dict of str to float): the share of the scored rows in which the entity is
             free to be swapped with this threshold.
         splits (dict of str to float): the best split of the scores, also where it is
-            not clear; NaN if all scores are equal.
+            not clear; without entities whose scores are all equal or at most 0.
         rows (int): the number of rows that the splits are from.
     """
 
@@ -94,18 +92,14 @@ class ThresholdSuggestions:
         """Returns all of it but the figure, as JSON values.
 
         Returns:
-            dict: by the names of the attributes; ``None`` for a split of equal scores.
+            dict: by the names of the attributes.
         """
-        splits = {
-            name: None if np.isnan(value) else value
-            for name, value in self.splits.items()
-        }
         return {
             "thresholds": dict(self.thresholds),
             "confidence": dict(self.confidence),
             "reasons": dict(self.reasons),
             "free": dict(self.free),
-            "splits": splits,
+            "splits": dict(self.splits),
             "rows": self.rows,
         }
 
@@ -169,7 +163,8 @@ class ThresholdSuggestions:
                     label="rows in which it moves",
                 )
             is_clear = self.confidence[name] != "unclear"
-            line = self.thresholds[name] if is_clear else self.splits[name]
+            lines = self.thresholds if is_clear else self.splits
+            line = lines.get(name, 0.0)
             if found.edges[0] <= line <= found.edges[-1]:
                 panel.axvline(
                     line,
@@ -315,21 +310,21 @@ def suggest_thresholds(
     if second_key is not None:
         other = _scores(data, as_key(second_key), layout, length)
         second = _picked(other, rows)
-    limits = _limits(scores)
+    lowest, highest, _ = score_limits(scores)
     confidence: dict[str, Confidence] = {}
     thresholds, splits, reasons, histograms = {}, {}, {}, {}
     for name in names:
         place = layout.index(name)
         values = own[:, place]
-        known = values < _UNKNOWN
+        known = values < UNKNOWN
         moves = motion[name][used].numpy() if name in motion else None
         split = split_scores(values[known], None if moves is None else moves[known])
         if second is not None:
             split = _compared(split, values, second[:, place], moves)
-        lowest, highest = (limit[place] for limit in limits)
         confidence[name], reasons[name] = split.confidence, split.reason
-        splits[name] = split.threshold
-        thresholds[name] = _threshold(split, lowest, highest)
+        if not np.isnan(split.threshold):
+            splits[name] = split.threshold
+        thresholds[name] = _threshold(split, lowest[place], highest[place])
         histograms[name] = _histogram(values[known], moves, known)
     free = _free_shares(scores, [layout.index(n) for n in names], thresholds)
     return ThresholdSuggestions(
@@ -433,17 +428,6 @@ def _picked(scores: torch.Tensor, rows: torch.Tensor) -> NDArray[np.float64]:
     return picked
 
 
-def _limits(scores: torch.Tensor) -> tuple[list[float], list[float]]:
-    """Returns the lowest and the highest score of each entity, of all rows."""
-    low = torch.full(scores.shape[1:], torch.inf, device=scores.device)
-    high = -low
-    for part in scores.split(_CHUNK):
-        unknown = part.isnan() | (part >= _UNKNOWN)
-        low = torch.minimum(low, part.masked_fill(unknown, torch.inf).amin(0))
-        high = torch.maximum(high, part.masked_fill(unknown, -torch.inf).amax(0))
-    return low.tolist(), high.tolist()
-
-
 def _threshold(split: Split, lowest: float, highest: float) -> float:
     if split.confidence == "two clear modes":
         return split.threshold
@@ -462,7 +446,7 @@ def _compared(
     """Compares a split with that of other scores of the same rows."""
     if split.confidence != "two clear modes":
         return split
-    known = (values < _UNKNOWN) & (second < _UNKNOWN)
+    known = (values < UNKNOWN) & (second < UNKNOWN)
     other = split_scores(second[known], None if moves is None else moves[known])
     if other.confidence != "two clear modes":
         reason = f"the second scores: {other.reason}"

@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence.thresholds import DEFAULT_THRESHOLD
+from torchrl_caiac.influence.threshold_rule import DEFAULT_THRESHOLD
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 from torchrl_caiac.transforms.draws import draw_batch_donors, uninfluenced
 from torchrl_caiac.transforms.goals.window import WindowGoal
