@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from torchrl_caiac.layouts.description import Columns, LayoutDescription
 
-__all__ = ["KITCHEN", "KITCHEN_POSITIONS"]
+__all__ = ["KITCHEN"]
 
 # Twice the usual millimetre and milliradian: the published results have this floor, and
 # it is above the noise of the robot's joints.
@@ -38,8 +38,7 @@ _OBJECTS = (
 )
 _GOALS = "The goal contains the configurations of all objects, 21 columns. "
 
-#: The 30 columns of ``KitchenEnv``.
-KITCHEN_POSITIONS = LayoutDescription(
+_POSITIONS = LayoutDescription(
     "kitchen/positions",
     (
         Columns("joint positions, rad and m", 9, "robot", _FLOOR, is_position=True),
@@ -69,4 +68,4 @@ _FRANKA = LayoutDescription(
 )
 
 #: The layouts of the kitchen.
-KITCHEN = (_FRANKA, KITCHEN_POSITIONS)
+KITCHEN = (_FRANKA, _POSITIONS)
