@@ -44,13 +44,9 @@ LAYERS = [
     {"influence"},
     {"transforms"},
     {"evaluation"},
-<<<<<<< HEAD
-    {"_figures", "plotting"},
+    {"plotting"},
     {"augment", "inspection", "report", "scored"},
     {"__main__", "cli"},
-=======
-    {"plotting"},
->>>>>>> thresholds
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))
