@@ -190,8 +190,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--tolerance",
         type=_tolerance,
         metavar="X",
-        help="motion, residual: the largest change that is not motion, in the data's units, or "
-        "auto: from the layout, or the noise at rest (default: auto)",
+        help="motion, residual: the largest change that is not motion, in the data's "
+        "units, or auto: from the layout, or the noise at rest (default: auto)",
     )
     group.add_argument(
         "--far",
