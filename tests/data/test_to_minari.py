@@ -169,7 +169,7 @@ ONES = torch.ones(8, 1)
             ValueError,
             r"lack \[\('next', 'truncated'\)\], they have",
         ),
-        (transitions(), {"exclude": ["cup"]}, KeyError, "'cup'.*correct exclude="),
+        (transitions(), {"exclude": ["cup"]}, KeyError, r"cup.*correct exclude="),
         (transitions(), {"action_bounds": ([0], [1])}, ValueError, r"shape \[1\], but"),
         (
             with_entries(action=ONES.half()),

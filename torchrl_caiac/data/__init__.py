@@ -16,11 +16,14 @@ from torchrl_caiac.data.load_robomimic import load_robomimic
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
+from torchrl_caiac.data.open_dataset import FORMATS, DatasetFormat, open_dataset
 from torchrl_caiac.data.to_minari import to_minari
 from torchrl_caiac.data.transition_writer import TransitionWriter
 from torchrl_caiac.data.write_transitions import write_transitions
 
 __all__ = [
+    "FORMATS",
+    "DatasetFormat",
     "TransitionWriter",
     "UnreadableFileError",
     "action_bounds",
@@ -37,6 +40,7 @@ __all__ = [
     "load_transitions",
     "mix_trajectories",
     "offline_buffer",
+    "open_dataset",
     "record_episode",
     "to_minari",
     "verify_digests",

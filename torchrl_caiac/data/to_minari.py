@@ -190,8 +190,8 @@ def _leaves(
     others -= {("next", *path) for path in {*states, *_SIGNALS}}
     if others:
         raise ValueError(
-            f"Minari has no place for {_names(others)}: leave them out with exclude=, or move "
-            "them under 'info'"
+            f"Minari has no place for {_names(others)}: leave them out with exclude=, "
+            "or move them under 'info'"
         )
     return found
 
@@ -306,8 +306,8 @@ class _Episodes:
             step = int(differ[0]) if len(differ) else 0
             raise ValueError(
                 f"the next {_names([path])[0]!r} of row {int(rows[step])} is not that "
-                f"of row {int(rows[min(step + 1, len(rows) - 1)])}, which follows it in "
-                "its trajectory, and Minari stores every state once: give whole "
+                f"of row {int(rows[min(step + 1, len(rows) - 1)])}, which follows it "
+                "in its trajectory, and Minari stores every state once: give whole "
                 "trajectories in the order of time"
             )
         return torch.cat([now, after[-1:]]).numpy()
