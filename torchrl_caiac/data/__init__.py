@@ -49,15 +49,3 @@ __all__ = [
     "write_digests",
     "write_transitions",
 ]
-
-
-def open_dataset(
-    source, path, *, format=None, overwrite=False, progress=True, **options
-):  # SHIM
-    from torchrl_caiac.data.load_ogbench import load_ogbench
-
-    if str(source).endswith(".npz"):
-        return load_ogbench(source, path, progress=progress, **options)
-    return load_minari(
-        source.removeprefix("minari://"), path, progress=progress, **options
-    )
