@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -146,11 +146,7 @@ def _arrays(file: Path, stack: ExitStack) -> Mapping[str, Any]:
     """Returns the arrays of a file, or what reads them in parts."""
     if file.suffix == ".npz":
         streams = stack.enter_context(NpzStreams(file, "file of arrays", _AGAIN))
-        return {
-            name: streams.take(name, kind.shape[0])
-            for name, kind in streams.kinds.items()
-            if kind.shape
-        }
+        return _Archive(streams)
     try:
         import h5py
     except ImportError as error:
@@ -175,6 +171,26 @@ def _arrays(file: Path, stack: ExitStack) -> Mapping[str, Any]:
         else:
             found |= {f"{name}/{inner}": _tree(item[inner]) for inner in item}
     return found
+
+
+class _Archive(Mapping[str, Any]):
+    """The arrays of an archive, read when they are asked for."""
+
+    def __init__(self, streams: NpzStreams) -> None:
+        self._streams = streams
+        self._shapes = {n: k.shape for n, k in streams.kinds.items() if k.shape}
+
+    def __getitem__(self, name: str) -> Any:
+        return self._streams.take(name, self._shapes[name][0])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._shapes)
+
+    def __len__(self) -> int:
+        return len(self._shapes)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._shapes
 
 
 def _tree(item: Any) -> Any:
