@@ -343,11 +343,11 @@ def _transitions(demo: Any, file: Path, where: str, options: _Options) -> Tensor
                     f"{where} has no {name!r}, it has {sorted(demo)}: correct the file"
                     f"{' or infos=' if name in options.infos else ''}"
                 )
-        actions = demo["actions"][()]
+        actions = _read(demo["actions"])
         # LIBERO stores them as uint8.
         rewards = demo["rewards"][()].astype(float) if "rewards" in demo else None
         infos = {name: _read(demo[name]) for name in options.infos}
-    except (OSError, RuntimeError, ValueError) as error:
+    except (AttributeError, OSError, RuntimeError, TypeError, ValueError) as error:
         if isinstance(error, UnreadableFileError) or where in str(error):
             raise
         raise UnreadableFileError(
