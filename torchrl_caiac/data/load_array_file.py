@@ -37,7 +37,9 @@ _ARGUMENTS = {
         "desired_goals",
         "next_achieved_goals",
     )
-} | {"terminations": "terminals", "truncations": "timeouts"}
+}
+_ARGUMENTS |= {"terminations": "terminals", "truncations": "timeouts"}
+_ARGUMENTS |= {"episodes": "episode_ids"}
 
 
 def load_array_file(
@@ -55,9 +57,11 @@ def load_array_file(
     The names of the arrays are those of the arguments of
     :func:`~torchrl_caiac.data.from_arrays`, as in files of D4RL: ``observations`` and
     ``actions`` are needed, and so are ``terminals``, ``timeouts``, ``episode_ids`` or
-    ``episode_lengths``, which say where episodes end. ``terminations`` and
-    ``truncations`` are read as ``terminals`` and ``timeouts``. In HDF5 files,
-    ``observations`` may be a group, which becomes a nested observation.
+    ``episode_lengths``, which say where episodes end. ``terminations``,
+    ``truncations`` and ``episodes`` are read as ``terminals``, ``timeouts`` and
+    ``episode_ids``. A group ``observations``, or arrays ``observations/<name>`` in an
+    ``.npz`` file, become a nested observation. These are also the files that
+    :mod:`torchrl_caiac.augment` writes.
 
     Args:
         file (str or Path): the file, ``.npz`` or HDF5.
@@ -178,19 +182,35 @@ class _Archive(Mapping[str, Any]):
 
     def __init__(self, streams: NpzStreams) -> None:
         self._streams = streams
-        self._shapes = {n: k.shape for n, k in streams.kinds.items() if k.shape}
+        # The arrays of a name: one, or those of a group.
+        self._parts: dict[str, list[str]] = {}
+        for name, kind in streams.kinds.items():
+            group = name.split("/")[0]
+            if kind.shape:
+                whole = group if group in _ARGUMENTS else name
+                self._parts.setdefault(whole, []).append(name)
 
     def __getitem__(self, name: str) -> Any:
-        return self._streams.take(name, self._shapes[name][0])
+        tree: dict[str, Any] = {}
+        for part in self._parts[name]:
+            array = self._streams.take(part, self._streams.kinds[part].shape[0])
+            if part == name:
+                return array
+            *above, last = part.split("/")[1:]
+            inner = tree
+            for group in above:
+                inner = inner.setdefault(group, {})
+            inner[last] = array
+        return tree
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._shapes)
+        return iter(self._parts)
 
     def __len__(self) -> int:
-        return len(self._shapes)
+        return len(self._parts)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._shapes
+        return name in self._parts
 
 
 def _tree(item: Any) -> Any:

@@ -232,7 +232,8 @@ def _names_in_npz(path: Path) -> set[str]:
     if path.suffix != ".npz":
         return set()
     with NpzStreams(path, "file of arrays", _AGAIN) as arrays:
-        return set(arrays.kinds)
+        # Arrays of a group are named "observations/arm".
+        return {name.split("/")[0] for name in arrays.kinds}
 
 
 def _is_ogbench(path: Path) -> bool:
