@@ -15,6 +15,7 @@ LAYERS = [
     {
         "_buffer_transform",
         "_columns",
+        "_figures",
         "_files",
         "_fingerprints",
         "_keys",
@@ -27,7 +28,9 @@ LAYERS = [
         "_layout_files",
         "_layout_format",
         "_layout_reading",
+        "_layout_short",
         "_layout_units",
+        "_layout_yaml",
         "entities",
         "trajectories",
     },
@@ -43,7 +46,9 @@ LAYERS = [
     {"influence"},
     {"transforms"},
     {"evaluation"},
-    {"_figures", "plotting"},
+    {"plotting"},
+    {"augment", "inspection", "report", "scored"},
+    {"__main__", "cli"},
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))

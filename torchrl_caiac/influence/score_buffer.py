@@ -41,6 +41,7 @@ from torchrl_caiac.influence.score_record import (
     settings_that_differ,
     write_record,
 )
+from torchrl_caiac.influence.score_spread import warn_of_one_side
 from torchrl_caiac.influence.scorer import Scorer, check_int, layout_of
 from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
@@ -128,6 +129,11 @@ def score_buffer(
 
     One process at a time may score a folder. Open data in a folder with
     :func:`torchrl_caiac.data.load_transitions`, which detects truncated files.
+
+    A warning names entities of which all scores lie on one side of the default
+    threshold of :class:`~torchrl_caiac.CAIACTransform`, so that they would be swapped
+    in no row, or in all of them; see
+    :func:`~torchrl_caiac.influence.suggest_thresholds`.
 
     Args:
         rb (ReplayBuffer): a buffer with a storage of tensordicts, ``[T]`` or
@@ -277,6 +283,9 @@ def score_buffer(
         )
     # Prefetched batches lack the leaf, or have it unscored.
     drop_prefetched(rb)
+    leaves = find_leaves(storage, key)
+    if number and leaves is not None and leaves.scores.ndim == 2:
+        warn_of_one_side(leaves.scores[: len(storage)], layout)
 
 
 def _one_pass(
