@@ -144,6 +144,14 @@ def test_large_data_are_sampled_and_the_same_twice() -> None:
     assert one.thresholds["lid"] > data["caiac", "score"][:, 2].max()
 
 
+def test_a_rare_high_score_of_what_never_moves_is_not_free() -> None:
+    data = world(60_000)
+    data["caiac", "score"][30_123, 2] = 1e6
+    found = suggest_thresholds(data, LAYOUT, max_rows=5000)
+    assert found.confidence["lid"] == "one mode: never influenced"
+    assert found.thresholds["lid"] < 100 and found.free["lid"] == 1 - 1 / 60_000
+
+
 def test_rows_without_scores_are_left_out() -> None:
     data = world()
     data["caiac", "score"][::2] = float("nan")
