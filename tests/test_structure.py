@@ -28,7 +28,9 @@ LAYERS = [
         "_layout_files",
         "_layout_format",
         "_layout_reading",
+        "_layout_short",
         "_layout_units",
+        "_layout_yaml",
         "entities",
         "trajectories",
     },
@@ -45,6 +47,8 @@ LAYERS = [
     {"transforms"},
     {"evaluation"},
     {"plotting"},
+    {"augment", "inspection", "report", "scored"},
+    {"__main__", "cli"},
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))
