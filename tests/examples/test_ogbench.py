@@ -34,15 +34,15 @@ def test_held_out_rows_are_of_other_episodes_and_steps_apart(steps, cfg):
     )
 
 
-def test_models_read_hand_and_cubes_and_predict_positions(steps, cfg):
+def test_models_read_and_predict_the_position_of_the_hand(steps, cfg):
     environment = steps.parts.make_environment(cfg)
     for maker, settings in (
         (steps.fit.make_gaussian, cfg.env.world_model),
         (steps.fit.make_transformer, cfg.env.transformer),
     ):
         model = maker(environment, settings)
-        assert model.config["inputs"]["robot"] == list(range(12, 19))
-        assert model.input_dim == 7 + 9 + 9 and model.predict_dim == 9
+        assert model.config["inputs"]["robot"] == [12, 13, 14]
+        assert model.input_dim == 3 + 9 + 9 and model.predict_dim == 9
         assert model.floor.tolist() == [0.01] * 9
 
 
