@@ -50,13 +50,13 @@ def test_the_sweep_has_a_line_for_each_floor_and_entity(steps, cfg, tmp_path):
     lines = steps.sweep_variance_floor.sweep(cfg)
     assert [(line["floor"], line["entity"]) for line in lines] == [
         (floor, cube)
-        for floor in ("1 mm", "layout", "auto")
+        for floor in ("1 mm", "auto")
         for cube in ("cube0", "cube1")
     ]
-    for line in lines[:4]:
+    for line in lines[:2]:
         torch.testing.assert_close(line["value"], 1e-3)
         assert line["reason"] is None
-    assert all(line["value"] > 0 and line["reason"] for line in lines[4:])
+    assert all(line["value"] > 0 and line["reason"] for line in lines[2:])
     # The fits are kept: a second call gives the same table.
     again = steps.sweep_variance_floor.sweep(cfg)
     texts = []
@@ -69,4 +69,4 @@ def test_the_sweep_has_a_line_for_each_floor_and_entity(steps, cfg, tmp_path):
         )
         texts.append((tmp_path / "table.csv").read_text())
     assert texts[0] == texts[1]
-    assert len(list(csv.DictReader(texts[0].splitlines()))) == 6
+    assert len(list(csv.DictReader(texts[0].splitlines()))) == 4
