@@ -109,7 +109,7 @@ def short_label(name: str, most: int = 34) -> str:
 
 
 def printable(text: str) -> str:
-    """Returns text without control characters, which XML does not allow.
+    r"""Returns text without control characters, which XML does not allow.
 
     Args:
         text (str): the text.
@@ -119,7 +119,7 @@ def printable(text: str) -> str:
 
     Examples:
         >>> from torchrl_caiac.report.svg import printable
-        >>> printable("two\\nlines")
+        >>> printable("two\nlines")
         'two lines'
     """
     return "".join(

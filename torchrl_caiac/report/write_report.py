@@ -129,6 +129,8 @@ def write_report(
             f"counterfactual_ratio is {counterfactual_ratio}, expected above 0 and at "
             "most 1"
         )
+    if isinstance(render, str) and render != "auto":
+        raise ValueError(f"render is {render!r}, expected a function, 'auto' or None")
     if file.is_dir():
         raise FileExistsError(
             f"{file} is a folder: name a file in it, such as report.html"
