@@ -27,7 +27,8 @@ addEventListener("load", () => {
   const wide = [...document.querySelectorAll("main *")].filter((element) => {
     const box = element.getBoundingClientRect();
     return box.width && (box.right > root.clientWidth + 1 || box.left < -1);
-  }).filter((element) => !element.closest("svg") || element.tagName === "svg");
+  }).filter((element) => !element.closest("thead") &&  // it is for screen readers
+    (!element.closest("svg") || element.tagName === "svg"));
   // Text of figures that is cut off at the edge of its figure.
   const cut = [...document.querySelectorAll("svg text")].filter((text) => {
     const box = text.getBoundingClientRect();
@@ -57,7 +58,8 @@ FRAME = """
 <script>
 addEventListener("message", (event) => { document.body.dataset.probe = event.data; });
 </script>
-<body><iframe src="probe.html" style="border: 0; width: {width}px; height: 900px"></iframe>
+<body>
+<iframe src="probe.html" style="border: 0; width: {width}px; height: 900px"></iframe>
 """
 
 
