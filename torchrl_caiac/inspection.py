@@ -271,7 +271,7 @@ def inspect_dataset(
         >>> found.proposal
         EntityLayout(
             robot: observation[0:2], fixed
-            entity0: observation[2:3]
+            entity0: observation[2]
         )
         >>> found.groups[1].moves
         0.25

@@ -56,6 +56,8 @@ class Environment(ABC):
     action_dim: int
     predicted: Mapping[str, Sequence[int]] | None = None
     """The columns that world models predict; ``None`` for all."""
+    inputs: Mapping[str, Sequence[int]] | None = None
+    """The columns that world models read; ``None`` for all."""
     goal_reference: str | None = None
     """The entity that positions are given relative to; ``None`` for none."""
     reward_fn: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None
@@ -74,6 +76,14 @@ class Environment(ABC):
     def action_spec(self) -> Bounded:
         """The action space, ``[A]``: [-1, 1] in every dimension."""
         return Bounded(-1.0, 1.0, (self.action_dim,))
+
+    @property
+    def positions_layout(self) -> EntityLayout:
+        """The layout with the predicted columns as the positions of the entities."""
+        content = self.layout.to_dict()
+        if self.predicted is not None:
+            content["positions"] = [[n, list(c)] for n, c in self.predicted.items()]
+        return EntityLayout.from_dict(content)
 
     @property
     def folder(self) -> Path:

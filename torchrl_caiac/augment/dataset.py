@@ -185,14 +185,12 @@ def _kept(scored: ScoredDataset) -> TensorDictBase:
 
 
 def _keys(values: list[Any]) -> Iterator[Any]:
+    """Yields the keys among keys, lists of keys, columns and ``None``."""
     for value in values:
         if isinstance(value, list):
             yield from value
-        elif isinstance(value, str) or (
-            isinstance(value, tuple) and all(isinstance(part, str) for part in value)
-        ):
-            if value:
-                yield value
+        elif value is not None and all(isinstance(part, str) for part in value):
+            yield value
 
 
 def _flagged(rows: TensorDictBase, scored: ScoredDataset) -> TensorDictBase:

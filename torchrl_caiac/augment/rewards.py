@@ -96,8 +96,8 @@ def find_sparse_reward(
         data (TensorDictBase): transitions ``[T]`` with goals.
         layout (EntityLayout): the entities, with goals.
         tolerance (float, optional): the largest distance that counts as reached.
-            Defaults to ``None``: found between the rows that reach their goals and
-            those that do not.
+            Defaults to ``None``: the number with the fewest digits that lies between
+            the distances of the rows that reach their goals and of those that do not.
 
     Keyword Args:
         reward_key (NestedKey): the rewards. Defaults to ``("next", "reward")``.
@@ -128,8 +128,8 @@ def find_sparse_reward(
         ...     },
         ...     [3],
         ... )
-        >>> round(find_sparse_reward(data, layout).tolerance, 3)
-        0.3
+        >>> find_sparse_reward(data, layout).tolerance
+        0.2
     """
     stored = get_leaf(
         data, reward_key, "the data lack the reward", "use the stored rewards"
@@ -214,5 +214,17 @@ def _between(gaps: torch.Tensor, reached: torch.Tensor) -> float:
     errors = (1 - hits).cumsum(0) + hits.sum() - hits.cumsum(0)
     place = int(errors.argmin())
     here = float(gaps[order[place]])
-    after = float(gaps[order[place + 1]]) if place + 1 < len(order) else here
-    return here if math.isclose(here, after) else (here + after) / 2
+    after = float(gaps[order[place + 1]]) if place + 1 < len(order) else 2 * here
+    return _roundest(here, after)
+
+
+def _roundest(low: float, high: float) -> float:
+    """Returns the number in ``[low, high)`` with the fewest digits, such as 0.05."""
+    if not 0 < low < high:
+        return low
+    for digits in range(1, 7):
+        step = 10.0 ** (math.floor(math.log10(high)) + 1 - digits)
+        found = round(math.ceil(low / step) * step, 12)
+        if low <= found < high:
+            return found
+    return low

@@ -154,7 +154,7 @@ class Console:
             # Nothing else on the standard output, where the result is expected.
             sys.stdout = err
             return
-        noise = stack.enter_context(tempfile.TemporaryFile("w+"))
+        noise = stack.enter_context(tempfile.TemporaryFile("w+"))  # noqa: SIM115
         # Libraries in C write to the descriptors themselves.
         for number, name in ((1, "_out"), (2, "_err")):
             stream = getattr(self, name)
@@ -165,10 +165,14 @@ class Console:
             stack.callback(os.close, saved)
             stack.callback(os.dup2, saved, number)
             os.dup2(noise.fileno(), number)
-            copy = open(  # noqa: SIM115
-                os.dup(saved), "w", encoding=stream.encoding, errors="backslashreplace"
+            copy = stack.enter_context(
+                os.fdopen(
+                    os.dup(saved),
+                    "w",
+                    encoding=stream.encoding,
+                    errors="backslashreplace",
+                )
             )
-            stack.callback(copy.close)
             setattr(self, name, copy)
         sys.stdout = noise
         sys.stderr = _BarsOnly(self._err, noise) if self._is_terminal else noise

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -22,6 +22,7 @@ from torchrl_caiac.influence import (
     AttentionInfluence,
     DistanceInfluence,
     MotionInfluence,
+    ResidualInfluence,
 )
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
@@ -87,6 +88,20 @@ def _motion(context: Context) -> MotionInfluence:
     return MotionInfluence(context.layout, tolerance=tolerance).fit(context.data)
 
 
+def _residual(context: Context) -> ResidualInfluence:
+    estimator = ResidualInfluence(
+        context.layout,
+        tolerance=context.settings["tolerance"],
+        far=context.settings["far"],
+    )
+    with context.console.step("fitting each entity alone"):
+        return estimator.fit(
+            context.data,
+            seed=context.settings["seed"],
+            progress=context.console.progress,
+        )
+
+
 def _distance(context: Context) -> DistanceInfluence:
     return DistanceInfluence(
         context.layout,
@@ -103,6 +118,7 @@ def _cai(context: Context) -> CAI:
             _action_dim(context.data),
             predict=context.layout.positions or None,
             widths=_widths(context),
+            variance_floor=_floor(context),
         )
 
     model = _fitted(context, new)
@@ -112,7 +128,10 @@ def _cai(context: Context) -> CAI:
 def _attention(context: Context) -> AttentionInfluence:
     def new() -> TransformerWorldModel:
         return TransformerWorldModel(
-            context.layout, _action_dim(context.data), widths=_widths(context)
+            context.layout,
+            _action_dim(context.data),
+            widths=_widths(context),
+            variance_floor=_floor(context),
         )
 
     model = _fitted(context, new)
@@ -127,6 +146,12 @@ ESTIMATORS: dict[str, EstimatorEntry] = {
         "what moves in the recording is influenced; needs nothing else",
         _motion,
         {"tolerance": "auto"},
+    ),
+    "residual": EstimatorEntry(
+        "what moves otherwise than it would alone is influenced; for things that roll "
+        "or fall, with velocities in the observation",
+        _residual,
+        {"tolerance": "auto", "far": None, "seed": 0},
     ),
     "cai": EstimatorEntry(
         "causal action influence, by a world model; minutes, and data with different "
@@ -165,8 +190,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--tolerance",
         type=_tolerance,
         metavar="X",
-        help="motion: the largest change that is not motion, in the data's units, or "
-        "auto: from the layout, or the noise at rest (default: auto)",
+        help="motion, residual: the largest change that is not motion, in the data's "
+        "units, or auto: from the layout, or the noise at rest (default: auto)",
+    )
+    group.add_argument(
+        "--far",
+        type=_positive,
+        metavar="X",
+        help="residual: fit to rows in which the robot is at least this far away, in "
+        "the units of the positions (default: all rows)",
     )
     group.add_argument(
         "--distance",
@@ -181,7 +213,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help=f"cai, attention: gradient steps of the fit (default: {_FIT['steps']})",
     )
     group.add_argument(
-        "--seed", type=int, metavar="N", help="cai, attention: of the fit (default: 0)"
+        "--seed",
+        type=int,
+        metavar="N",
+        help="residual, cai, attention: of the fit (default: 0)",
     )
     group.add_argument(
         "--num-actions",
@@ -292,6 +327,11 @@ def _action_dim(data: TensorDictBase) -> int:
 
 def _widths(context: Context) -> dict[str, int] | None:
     return None if context.layout.is_flat else context.layout.widths(context.data[:1])
+
+
+def _floor(context: Context) -> Literal["auto"] | None:
+    """Returns that the layout's floor is used, or one that is found in the data."""
+    return None if context.layout.variance_floor else "auto"
 
 
 def _fitted(

@@ -33,6 +33,12 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--out", metavar="FILE", help="the page; default: report.html in DIR"
     )
+    parser.add_argument("--title", metavar="TEXT", help="the heading of the page")
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace FILE if it exists; report.html in DIR is always replaced",
+    )
     parser.set_defaults(run=run)
     return parser
 
@@ -45,10 +51,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
     out = Path(args.out) if args.out else folder / "report.html"
     if out.is_dir():
         raise UsageError(f"--out {out} is a folder: give the name of a file")
+    if args.out and out.exists() and not args.overwrite:
+        raise UsageError(f"{out} exists: give another name, or pass --overwrite")
     with console.step("reading the scored dataset"):
         scored = open_scored(folder)
     with console.step("writing the report"):
-        written = write_report(scored, out)
+        written = write_report(scored, out, title=args.title, overwrite=True)
     console.text(f"written to {written}")
     console.document({"written": str(written)})
     return OK

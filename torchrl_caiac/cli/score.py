@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tensordict import TensorDict
-
 from torchrl_caiac._files import claim_folder, read_json, write_json
 from torchrl_caiac.check import check_dataset
 from torchrl_caiac.cli.console import Console
@@ -31,7 +29,11 @@ from torchrl_caiac.cli.sources import (
 )
 from torchrl_caiac.data import action_bounds, offline_buffer
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence import score_buffer, suggest_thresholds
+from torchrl_caiac.influence import (
+    action_coverage,
+    score_buffer,
+    suggest_thresholds,
+)
 from torchrl_caiac.scored import ScoredDataset, write_scored
 
 __all__ = ["add_parser", "run"]
@@ -197,6 +199,7 @@ def _score(
         _write_scores(rb, estimator, context, replace=replace)
     with console.step("suggesting thresholds"):
         suggestions = suggest_thresholds(rb, layout)
+    coverage = _coverage(context)
     return write_scored(
         context.folder,
         layout,
@@ -205,7 +208,7 @@ def _score(
         settings=context.settings,
         source=described,
         warnings=console.warnings,
-        coverage=_coverage(args, data, layout),
+        coverage=coverage,
     )
 
 
@@ -226,10 +229,21 @@ def _write_scores(rb: Any, estimator: Any, context: Context, *, replace: bool) -
         score_buffer(rb, estimator, overwrite=True, **arguments)
 
 
-def _coverage(
-    args: argparse.Namespace, data: TensorDict, layout: EntityLayout
-) -> dict[str, Any] | None:
-    return None
+def _coverage(context: Context) -> dict[str, Any] | None:
+    """Returns how far a world model's comparison of actions is backed by the data."""
+    if "num_actions" not in context.settings and "steps" not in context.settings:
+        return None
+    with context.console.step("looking at the actions"):
+        try:
+            found = action_coverage([context.data, *context.more], context.layout)
+        except ImportError as error:
+            context.console.warn(
+                f"whether the data hold different actions is not known: {error}"
+            )
+            return None
+    if found.verdict != "many":
+        context.console.warn(found.advice)
+    return found.to_dict()
 
 
 def _show(scored: ScoredDataset, console: Console) -> None:

@@ -91,8 +91,8 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
         "--layout",
         required=True,
         metavar="L",
-        help="which columns belong to which entity: the name of a ready layout, such as "
-        "ogbench/cube-double, or a .json or .yaml file",
+        help="which columns belong to which entity: the name of a ready layout, such "
+        "as ogbench/cube-double, or a .json or .yaml file",
     )
 
 
@@ -198,7 +198,7 @@ def _local(source: str) -> Path | None:
     Raises:
         UsageError: it looks like a path, but nothing is there.
     """
-    scheme, sign, _ = source.partition("://")
+    _, sign, _ = source.partition("://")
     if sign:
         return None
     path = Path(source).expanduser()
@@ -362,7 +362,10 @@ def _convert(
             rows.exclude("caiac"), data, action_bounds=action_bounds(rows)
         )
         return
-    from torchrl_caiac.data import open_dataset
+    try:
+        from torchrl_caiac.data import open_dataset
+    except ImportError:  # SHIM
+        open_dataset = _shim
 
     open_dataset(
         source,
@@ -370,4 +373,15 @@ def _convert(
         format=described["format"],
         progress=console.progress,
         **described["options"],
+    )
+
+
+def _shim(source, path, *, format=None, progress=True, **options):  # SHIM
+    from torchrl_caiac.data import load_minari
+    from torchrl_caiac.data.load_ogbench import load_ogbench
+
+    if str(source).endswith(".npz"):
+        return load_ogbench(source, path, progress=progress, **options)
+    return load_minari(
+        source.removeprefix("minari://"), path, progress=progress, **options
     )

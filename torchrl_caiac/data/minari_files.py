@@ -13,6 +13,7 @@ from torchrl_caiac._files import UnreadableFileError, whole_folder
 from torchrl_caiac.data.minari_checks import check_metadata
 
 if TYPE_CHECKING:
+    from gymnasium import Space
     from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
 
@@ -180,13 +181,14 @@ def publish_dataset(
     dataset_id: str,
     buffers: Iterable[EpisodeBuffer],
     target: Path,
-    make_env: Callable[[], Any],
+    make_env: Callable[[], Any] | None,
     *,
     code: str,
     requirements: Sequence[str],
     progress: bool,
     description: str,
     algorithm_name: str,
+    spaces: tuple[Space[Any], Space[Any]] | None = None,
 ) -> MinariDataset:
     """Writes a Minari dataset, atomically.
 
@@ -195,7 +197,8 @@ def publish_dataset(
         buffers (iterable of EpisodeBuffer): the episodes.
         target (Path): the folder, as returned by :func:`free_dataset_path`. It is
             replaced if it exists.
-        make_env (callable): creates the environment, whose specification Minari stores.
+        make_env (callable, optional): creates the environment, whose specification
+            Minari stores. ``None``: it is unknown, and ``spaces`` are given.
 
     Keyword Args:
         code (str): the file that collected the dataset.
@@ -204,6 +207,9 @@ def publish_dataset(
         progress (bool): whether to show a progress bar.
         description (str): the content of the dataset.
         algorithm_name (str): the policy that acted.
+        spaces (tuple of gymnasium.Space, optional): the spaces of the observations and
+            of the actions. Images are then stored without loss. Defaults to ``None``:
+            those of the environment.
 
     Returns:
         MinariDataset: the dataset.
@@ -240,7 +246,12 @@ def publish_dataset(
     from minari import MinariDataset
     from tqdm import tqdm
 
-    env = make_env()
+    env = None if make_env is None else make_env()
+    options: dict[str, Any] = {}
+    if spaces is not None:
+        # Minari would compress images as JPEG.
+        options = {"jpeg_encoding": False}
+        options["observation_space"], options["action_space"] = spaces
     try:
         with whole_folder(target) as made:
             partial = made.parent / "minari"
@@ -258,6 +269,7 @@ def publish_dataset(
                     code_permalink=code,
                     description=description,
                     requirements=list(requirements),
+                    **options,
                 )
             built = partial / dataset_id
             # Minari stores the description of a namespace in a separate file.
@@ -266,5 +278,6 @@ def publish_dataset(
                     os.replace(extra, target.parent / extra.name)
             os.replace(built, made)
     finally:
-        env.close()
+        if env is not None:
+            env.close()
     return MinariDataset(target / "data")

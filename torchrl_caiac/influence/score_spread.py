@@ -92,5 +92,5 @@ def warn_of_one_side(scores: torch.Tensor, layout: EntityLayout) -> None:
         warnings.warn(
             f"with the default threshold {DEFAULT_THRESHOLD}, {'; '.join(found)}. "
             "Choose thresholds with suggest_thresholds(rb, layout)",
-            stacklevel=3,
+            stacklevel=4,
         )

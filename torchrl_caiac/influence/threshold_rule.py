@@ -48,7 +48,7 @@ class Split(NamedTuple):
 
     Attributes:
         threshold (float): the best split, whether it is clear or not; NaN if all scores
-            are equal.
+            are equal, or none is above 0.
         confidence (str): how clear it is.
         reason (str): why.
         area (float): the probability that a row in which the entity moves scores above
@@ -92,34 +92,28 @@ def split_scores(
         ('two clear modes', 0.03)
     """
     area = float("nan")
-    if not len(scores) or scores.min() == scores.max():
-        value = float(scores[0]) if len(scores) else float("nan")
-        threshold = float("nan")
-    else:
-        value = float("nan")
-        threshold = _start(scores)
+    threshold = _start(scores)
     if len(scores) < _FEWEST_ROWS:
         reason = f"only {len(scores)} rows have scores, at least {_FEWEST_ROWS} needed"
         return Split(threshold, "unclear", reason, area)
-    if value <= 0:
-        reason = "all scores are 0"
-        return Split(threshold, "one mode: never influenced", reason, area)
+    equal = ""
+    if np.isnan(threshold):
+        equal = f"all scores are {scores[0]:.3g}"
+        if scores.max() <= 0:
+            equal = "no score is above 0"
     if motion is None:
-        if np.isnan(threshold):
-            return Split(
-                threshold,
-                "unclear",
-                f"all scores are {value:.3g}, and {why_unknown}",
-                area,
-            )
-        return _by_scores(scores, threshold, why_unknown)
+        if not equal:
+            return _by_scores(scores, threshold, why_unknown)
+        if scores.max() <= 0:
+            return Split(threshold, "one mode: never influenced", equal, area)
+        return Split(threshold, "unclear", f"{equal}, and {why_unknown}", area)
     moves, rests = scores[motion == MOVES], scores[motion == RESTS]
     counts = f"{len(moves)} of {len(scores)} rows"
     if not (motion != RESTS).any():
         reason = f"it never moves in {len(scores)} rows"
         return Split(threshold, "one mode: never influenced", reason, area)
-    if np.isnan(threshold):
-        reason = f"all scores are {value:.3g}, but it moves in {counts}"
+    if equal:
+        reason = f"{equal}, but it moves in {counts}"
         return Split(threshold, "unclear", reason, area)
     if len(rests) < _FEWEST_MOVES:
         low, high = np.quantile(scores, [0.05, 0.95])
@@ -135,16 +129,19 @@ def split_scores(
 
 
 def _start(scores: NDArray[np.float64]) -> float:
-    """Returns the split of the scores alone."""
+    """Returns the split of the scores alone, NaN if there is nothing to split."""
     positive = scores[scores > 0]
-    if not len(positive):
-        return 0.0  # all are at most zero
+    if not len(positive) or scores.min() == scores.max():
+        return float("nan")
     least = float(positive.min())
-    zeros = 1 - len(positive) / len(scores)
-    if zeros and least >= _SPREAD * float(np.median(positive)):
+    has_zeros = scores.min() == 0
+    if has_zeros and least >= _SPREAD * float(np.median(positive)):
         return least / 2
     floor = max(least, _SMALLEST * float(np.quantile(scores, 0.999)))
-    return float(10.0 ** _otsu(np.log10(np.maximum(scores, floor))))
+    logs = np.log10(np.maximum(scores, floor))
+    if logs.min() == logs.max():
+        return least / 2
+    return float(10.0 ** _otsu(logs))
 
 
 def _otsu(values: NDArray[np.float64]) -> float:
@@ -209,10 +206,14 @@ def _by_scores(
     scores: NDArray[np.float64], threshold: float, why_unknown: str
 ) -> Split:
     """Judges the split of the scores alone."""
+    if scores.min() < 0:
+        reason = f"some scores are negative, and {why_unknown}"
+        return Split(threshold, "unclear", reason, float("nan"))
     low, high = scores[scores <= threshold], scores[scores > threshold]
     share = min(len(low), len(high)) / len(scores)
     near = (scores > threshold / 10**0.25) & (scores <= threshold * 10**0.25)
-    contrast = float(np.median(high)) / max(float(np.median(low)), 1e-300)
+    middle = float(np.median(low))
+    contrast = float(np.median(high)) / middle if middle else float("inf")
     between = near.mean() / share
     modes = (
         f"the scores alone ({why_unknown}) have {100 * share:.3g} % of the rows in the "

@@ -74,7 +74,7 @@ class ThresholdSuggestions:
         free (dict of str to float): the share of the scored rows in which the entity is
             free to be swapped with this threshold.
         splits (dict of str to float): the best split of the scores, also where it is
-            not clear; NaN if all scores are equal.
+            not clear; without entities whose scores are all equal or at most 0.
         rows (int): the number of rows that the splits are from.
     """
 
@@ -92,18 +92,14 @@ class ThresholdSuggestions:
         """Returns all of it but the figure, as JSON values.
 
         Returns:
-            dict: by the names of the attributes; ``None`` for a split of equal scores.
+            dict: by the names of the attributes.
         """
-        splits = {
-            name: None if np.isnan(value) else value
-            for name, value in self.splits.items()
-        }
         return {
             "thresholds": dict(self.thresholds),
             "confidence": dict(self.confidence),
             "reasons": dict(self.reasons),
             "free": dict(self.free),
-            "splits": splits,
+            "splits": dict(self.splits),
             "rows": self.rows,
         }
 
@@ -167,7 +163,8 @@ class ThresholdSuggestions:
                     label="rows in which it moves",
                 )
             is_clear = self.confidence[name] != "unclear"
-            line = self.thresholds[name] if is_clear else self.splits[name]
+            lines = self.thresholds if is_clear else self.splits
+            line = lines.get(name, 0.0)
             if found.edges[0] <= line <= found.edges[-1]:
                 panel.axvline(
                     line,
@@ -325,7 +322,8 @@ def suggest_thresholds(
         if second is not None:
             split = _compared(split, values, second[:, place], moves)
         confidence[name], reasons[name] = split.confidence, split.reason
-        splits[name] = split.threshold
+        if not np.isnan(split.threshold):
+            splits[name] = split.threshold
         thresholds[name] = _threshold(split, lowest[place], highest[place])
         histograms[name] = _histogram(values[known], moves, known)
     free = _free_shares(scores, [layout.index(n) for n in names], thresholds)

@@ -44,7 +44,7 @@ _HAMMER = LayoutDescription(
     "adroit/hammer",
     (
         _hand(26),
-        Columns("insertion, m", 1, "nail", is_position=True),
+        Columns("insertion, m", 1, "nail", is_position=True, bounds=(-0.1, 0.2)),
         Columns("velocity, m/s", 3, "hammer", MILLIMETRE / _STEPS, bounds=(-1, 1)),
         Columns("angular velocity, rad/s", 3, "hammer", TURN / _STEPS, bounds=(-1, 1)),
         _PALM,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from torchrl_caiac.layouts.description import Columns, LayoutDescription
 
-__all__ = ["KITCHEN", "KITCHEN_POSITIONS"]
+__all__ = ["KITCHEN"]
 
 # Twice the usual millimetre and milliradian: the published results have this floor, and
 # it is above the noise of the robot's joints.
@@ -36,10 +36,9 @@ _OBJECTS = (
         "orientation, quaternion wxyz", 4, "kettle", _FLOOR, is_goal=True, is_unit=True
     ),
 )
-_GOALS = "The goal contains the configurations of all objects, 21 columns. "
+_GOALS = "The goal contains the configurations of all objects, 21 columns."
 
-#: The 30 columns of ``KitchenEnv``.
-KITCHEN_POSITIONS = LayoutDescription(
+_POSITIONS = LayoutDescription(
     "kitchen/positions",
     (
         Columns("joint positions, rad and m", 9, "robot", _FLOOR, is_position=True),
@@ -64,9 +63,9 @@ _FRANKA = LayoutDescription(
     ("robot",),
     "The observation of FrankaKitchen-v1. "
     + _GOALS
-    + "Goals of FrankaKitchen-v1 are one entry for each task: leave 'achieved_goal' "
+    + " Goals of FrankaKitchen-v1 are one entry for each task: leave 'achieved_goal' "
     "and 'desired_goal' out of the data, goals are then read from later states.",
 )
 
 #: The layouts of the kitchen.
-KITCHEN = (_FRANKA, KITCHEN_POSITIONS)
+KITCHEN = (_FRANKA, _POSITIONS)

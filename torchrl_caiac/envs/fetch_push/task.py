@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.layouts.fetch import fetch_push_cubes
 
 __all__ = [
     "CUBE_WIDTH",
@@ -48,14 +49,7 @@ def fetch_push_layout(num_cubes: int = 2) -> EntityLayout:
     """
     if num_cubes < 1:
         raise ValueError(f"num_cubes is {num_cubes}, expected at least 1")
-    first = [GRIPPER_WIDTH + CUBE_WIDTH * i for i in range(num_cubes)]
-    cubes = {f"cube{i}": range(c, c + CUBE_WIDTH) for i, c in enumerate(first)}
-    return EntityLayout(
-        {"gripper": range(GRIPPER_WIDTH), **cubes},
-        goal={name: range(3 * i, 3 * i + 3) for i, name in enumerate(cubes)},
-        achieved={name: columns[:3] for name, columns in cubes.items()},
-        fixed=("gripper",),
-    )
+    return fetch_push_cubes(num_cubes).layout()
 
 
 def fetch_push_distances(achieved: Any, desired: Any) -> Any:

@@ -11,7 +11,7 @@ from gymnasium_robotics.envs.franka_kitchen.kitchen_env import (
     OBS_ELEMENT_INDICES,
 )
 
-from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.layouts import ready_layout
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -60,30 +60,8 @@ BURNER_RATIO = 174.0
 #: Angle of the light switch per unit of its light joint.
 LIGHT_RATIO = 14.0
 
-_COLUMNS: dict[str, range] = {
-    "robot": range(0, 9),
-    "bottom_right_burner": range(9, 11),
-    "bottom_burner": range(11, 13),
-    "top_right_burner": range(13, 15),
-    "top_burner": range(15, 17),
-    "light_switch": range(17, 19),
-    "slide_cabinet": range(19, 20),
-    "hinge_cabinet": range(20, 22),
-    "microwave": range(22, 23),
-    "kettle": range(23, 30),
-}
-_GOAL_COLUMNS = {
-    name: [column - OBJECTS.start for column in columns]
-    for name, columns in _COLUMNS.items()
-    if name != "robot"
-}
 #: The entities of the 30-column state and the goal's columns of each object.
-KITCHEN_LAYOUT = EntityLayout(
-    _COLUMNS,
-    goal=_GOAL_COLUMNS,
-    achieved={name: _COLUMNS[name] for name in _GOAL_COLUMNS},
-    fixed=("robot",),
-)
+KITCHEN_LAYOUT = ready_layout("kitchen/positions")
 #: State columns of each task's object.
 TASK_COLUMNS: dict[str, NDArray[np.int64]] = {
     task: np.asarray(OBS_ELEMENT_INDICES[task.replace("_", " ")])
@@ -95,9 +73,9 @@ TASK_GOALS: dict[str, NDArray[np.float64]] = {
     for task in KITCHEN_TASKS
 }
 # [21, 9]: 1 where a goal column belongs to an object.
-_MEMBERSHIP = np.zeros((21, len(_GOAL_COLUMNS)), dtype=np.float64)
-for _index, _columns in enumerate(_GOAL_COLUMNS.values()):
-    _MEMBERSHIP[_columns, _index] = 1.0
+_MEMBERSHIP = np.zeros((21, len(KITCHEN_LAYOUT.goal)), dtype=np.float64)
+for _index, _columns in enumerate(KITCHEN_LAYOUT.goal.values()):
+    _MEMBERSHIP[list(_columns), _index] = 1.0
 # Upstream's goals are rounded: coupled joints agree with each other here. The right
 # burners have no task of their own and turn like the left ones.
 _SOLVED: dict[str, NDArray[np.float64]] = {
