@@ -246,7 +246,7 @@ def draw_lengths(lengths: NDArray[Any], *, name: str, description: str) -> str:
     with drawing():
         figure = new_figure(_NARROW, 1.6)
         axes = figure.add_subplot()
-        axes.hist(lengths, edges, color=RECORDED, rwidth=0.9)
+        axes.hist(lengths, edges.tolist(), color=RECORDED, rwidth=0.9)
         axes.set_xlabel("length of a trajectory, transitions")
         axes.set_ylabel("trajectories")
         axes.locator_params(integer=True, nbins=5)
@@ -286,7 +286,7 @@ def draw_plan(
             _dots(axes, before, after, swapped)
             axes.annotate(
                 short_label(entity, 16),
-                after,
+                (after[0], after[1]),
                 # On three sides in turn, as entities may be close.
                 xytext=((0, 9), (0, -17), (10, -3))[number % 3],
                 textcoords="offset points",
