@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torchrl_caiac
-from torchrl_caiac.report.contents import ReportContents, ReportSettings
+from torchrl_caiac.report.contents import ReportContents
+from torchrl_caiac.report.settings import ReportSettings
 from torchrl_caiac.report.svg import printable
 from torchrl_caiac.report.swaps import CELLS, PLANE
 from torchrl_caiac.scored import ScoredDataset
