@@ -104,7 +104,7 @@ def influence_panels(
         rows = index.rows(torch.arange(last - length + 1, last + 1))
         flags = influenced[rows][:, shown]
         parts = [
-            f"{name} in {int(count)} steps"
+            f"{name} in {int(count):,} steps"
             for name, count in zip(names, flags.sum(0), strict=True)
             if count
         ]
@@ -123,7 +123,7 @@ def influence_panels(
                         f"steps. The agent influences {said}."
                     ),
                 ),
-                f"{length} steps. Influenced: {said}.",
+                f"{length:,} steps. Influenced: {said}.",
             )
         )
     return panels, hidden
