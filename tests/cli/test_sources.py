@@ -203,7 +203,7 @@ def short_actions() -> str:
         (empty_file, ["empty.npz"]),
         (not_finite, ["nan.npz", "NaN"]),
         (mixed_widths, ["mixed.hdf5", "demo_2"]),
-        (short_actions, ["short.npz", "actions"]),
+        (short_actions, ["short.npz", "timeouts have shape [240]"]),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
