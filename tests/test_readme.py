@@ -68,6 +68,25 @@ def make_dataset(name: str, episodes: int = 4, steps: int = 30) -> None:
     )
 
 
+def test_from_arrays_to_a_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    readme = (ROOT / "README.md").read_text()
+    (code,) = [b for b in python_blocks(readme) if "MotionInfluence(" in b]
+    lines = [x for x in code.splitlines() if x.strip() and not x.startswith("#")]
+    assert len(lines) <= 15
+    (shown,) = re.findall(r"```text\ntensor\(\[ *0, *(\d+)\]\)\n```", readme)
+    counts = []
+    for _ in range(2):  # the second run opens what the first one wrote
+        exec(compile(code, "README.md", "exec"), {})
+        printed = capsys.readouterr().out
+        counts += re.findall(r"^tensor\(\[ *0, *(\d+)\]\)$", printed, re.MULTILINE)
+    assert len(counts) == 2
+    for count in (int(shown), *map(int, counts)):
+        assert 85 <= count <= 118  # about 0.8 of 128, the cups that nothing carries
+
+
 def test_bring_your_own_dataset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

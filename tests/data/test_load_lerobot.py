@@ -259,6 +259,7 @@ def test_errors_of_frames_name_file_and_key_and_leave_nothing(
     [
         ({"keys": ["observation.cup"]}, KeyError, r"\['observation.cup'\] .*keys="),
         ({"keys": []}, ValueError, "keys is empty"),
+        ({"keys": ["action", "action"]}, ValueError, "a feature twice"),
         ({"action": "actions"}, KeyError, "'actions'.*'action'.*correct action="),
         ({"infos": ["cup"]}, KeyError, "correct infos="),
         ({"exclude": ["cup"]}, KeyError, "correct exclude="),

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
 
 import h5py
 import numpy as np
@@ -217,6 +220,7 @@ def replaced(key, value):
         (None, {"infos": ["cup"]}, KeyError, "no 'cup', .*correct the file or infos="),
         (None, {"keys": ["agentview_image"]}, ValueError, "keys="),
         (None, {"keys": []}, ValueError, "at least one"),
+        (None, {"keys": ["object", "object"]}, ValueError, "an entry twice"),
         (None, {"keys": ["object"], "exclude": ["object"]}, ValueError, "do not apply"),
         (None, {"observed": "then"}, ValueError, "'then', expected 'before'"),
         (
@@ -309,3 +313,72 @@ def test_links_to_other_files_are_refused(tmp_path):
 
     with pytest.raises(UnreadableFileError, match=r"demo_2.*link"):
         load(write(tmp_path / "a.hdf5", edit=edit))
+
+
+@contextmanager
+def robosuite_on_this_mujoco() -> Iterator[None]:
+    """robosuite 1.5.1 computes inertias of its controllers as older MuJoCo did."""
+    import mujoco
+    from robosuite.utils import binding_utils
+
+    with pytest.MonkeyPatch.context() as patch:
+        inertia = lambda model, out, matrix: np.copyto(out, np.eye(len(out)))  # noqa: E731
+        patch.setattr(mujoco, "mj_fullM", inertia)
+        patch.setattr(binding_utils.MjData, "qM", None, raising=False)
+        yield
+
+
+@pytest.fixture(scope="module")
+def lift(tmp_path_factory):
+    """A file with two rollouts of robosuite's Lift, and the observations in them."""
+    import robosuite
+
+    def seen(observation):
+        kept = {"object": observation["object-state"]}
+        kept |= {k: v for k, v in observation.items() if k.startswith("robot0_")}
+        return {k: np.array(v) for k, v in kept.items() if "proprio" not in k}
+
+    file, random = (
+        tmp_path_factory.mktemp("lift") / "lift.hdf5",
+        np.random.default_rng(0),
+    )
+    rollouts = []
+    with robosuite_on_this_mujoco(), h5py.File(file, "w") as stored:
+        env = robosuite.make(
+            "Lift",
+            robots="Panda",
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+        )
+        for number, length in enumerate((4, 3)):
+            states, actions, simulator = [seen(env.reset())], [], []
+            for _ in range(length):
+                actions.append(random.uniform(-1, 1, env.action_dim))
+                simulator.append(env.sim.get_state().flatten())
+                states.append(seen(env.step(actions[-1])[0]))
+            group = stored.create_group(f"data/demo_{number}")
+            group["actions"], group["states"] = np.stack(actions), np.stack(simulator)
+            for key in states[0]:
+                group[f"obs/{key}"] = np.stack([state[key] for state in states[:-1]])
+                group[f"next_obs/{key}"] = np.stack([s[key] for s in states[1:]])
+            rollouts.append(states)
+        env.close()
+    return file, rollouts
+
+
+def test_rollouts_of_robosuite_are_read(lift, tmp_path):
+    file, rollouts = lift
+    keys = ["object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
+    data = load_robomimic(file, tmp_path / "a", progress=False, infos=["states"])
+    flat = load_robomimic(file, tmp_path / "b", progress=False, keys=keys)
+    assert flat["observation"].shape == (7, 10 + 3 + 4 + 2)
+    row = 0
+    for states in rollouts:
+        for now, after in pairwise(states):
+            for key, value in now.items():
+                leaf = data["observation", key][row].numpy()
+                assert np.array_equal(leaf, np.atleast_1d(value).astype("f"))
+            joined = np.concatenate([after[key] for key in keys]).astype("f")
+            assert np.array_equal(flat["next", "observation"][row], joined)
+            row += 1

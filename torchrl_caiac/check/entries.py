@@ -7,6 +7,7 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join, leaf_names
+from torchrl_caiac._layout_reading import check_width
 from torchrl_caiac.check.kinds import finding
 from torchrl_caiac.check.report import Finding
 from torchrl_caiac.entities import EntityLayout
@@ -136,13 +137,13 @@ def _check_state(
             "tensor"
         )
         return finding("wrong_shape", message, key=key)
-    needed = 1 + max(max(columns) for columns in layout.columns.values())
-    if value.ndim != 2 or value.shape[1] < needed:
-        message = (
-            f"{key!r} has shape {list(value.shape)}, expected [T, D] with D of at "
-            f"least {needed}"
-        )
+    if value.ndim != 2:
+        message = f"{key!r} has shape {list(value.shape)}, expected [T, D]"
         return finding("wrong_shape", message, key=key)
+    try:
+        check_width(layout, value.shape[1], key)
+    except ValueError as error:
+        return finding("wrong_shape", str(error), key=key)
     return None
 
 

@@ -8,6 +8,7 @@ from torchrl_caiac.data.collect import collect_episodes, load_episode, record_ep
 from torchrl_caiac.data.digests import verify_digests, write_digests
 from torchrl_caiac.data.episodes import episode_transitions
 from torchrl_caiac.data.from_arrays import from_arrays
+from torchrl_caiac.data.from_replay_buffer import from_replay_buffer
 from torchrl_caiac.data.from_stream import from_stream
 from torchrl_caiac.data.load_lerobot import lerobot_tasks, load_lerobot
 from torchrl_caiac.data.load_minari import load_minari
@@ -30,6 +31,7 @@ __all__ = [
     "collect_episodes",
     "episode_transitions",
     "from_arrays",
+    "from_replay_buffer",
     "from_stream",
     "lerobot_tasks",
     "load_episode",

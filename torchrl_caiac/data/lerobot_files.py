@@ -324,7 +324,7 @@ def _array(column: Any, name: str, shape: tuple[int, ...], file: Path) -> NDArra
     """Converts a column, in which every frame may be a nested list, to an array."""
     import pyarrow as pa
 
-    rows, sizes = len(column), []
+    rows, sizes = len(column), list[int]()
     while True:
         if isinstance(column, pa.ExtensionArray):
             column = column.storage

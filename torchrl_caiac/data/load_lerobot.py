@@ -246,6 +246,8 @@ def _names(
     there = description.shapes
     if keys is not None and not keys:
         raise ValueError("keys is empty: name at least one feature, or leave it out")
+    if keys is not None and len(set(keys)) != len(keys):
+        raise ValueError(f"keys={list(keys)} names a feature twice: name it once")
     asked = {"keys": keys or (), "action": (action,), "infos": infos}
     for option, wanted in {**asked, "exclude": exclude}.items():
         known = {*there, *description.cameras} if option == "exclude" else there

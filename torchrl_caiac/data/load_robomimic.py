@@ -147,6 +147,8 @@ def load_robomimic(
         raise ValueError(
             f"observed is {observed!r}, expected 'before', 'after' or None"
         )
+    if keys is not None and len(set(keys)) != len(keys):
+        raise ValueError(f"keys={list(keys)} names an entry twice: name it once")
     if keys is not None and (not keys or images or exclude):
         raise ValueError(
             f"keys={list(keys)} joins entries to a flat observation, so it must have "

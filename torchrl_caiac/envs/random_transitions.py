@@ -103,9 +103,9 @@ def random_transitions(
     Args:
         env (callable): makes the environment, in each process: a class or a
             ``functools.partial`` of one, such as
-            :class:`~torchrl_caiac.envs.ogbench.OGBenchSimulator`,
-            :class:`~torchrl_caiac.envs.kitchen.RestorableKitchen` or
-            :class:`~torchrl_caiac.envs.fetch_push.RestorableFetchPush`. For others a
+            :class:`~torchrl_caiac.envs.OGBenchSimulator`,
+            :class:`~torchrl_caiac.envs.RestorableKitchen` or
+            :class:`~torchrl_caiac.envs.RestorableFetchPush`. For others a
             class of a few lines is enough, see :class:`RestorableEnv`.
         states (array_like): the states ``[M, S]``.
         actions_per_state (int): the number of times that each state is restored, for
@@ -146,8 +146,7 @@ def random_transitions(
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_caiac.envs import random_transitions
-        >>> from torchrl_caiac.envs.ogbench import OGBenchSimulator
+        >>> from torchrl_caiac.envs import OGBenchSimulator, random_transitions
         >>> simulator = OGBenchSimulator("cube-double")
         >>> states = np.stack([simulator.reset(seed=i) for i in range(3)])
         >>> rows = random_transitions(
@@ -192,9 +191,7 @@ def random_transitions(
             description=f"random actions, {states_per_file} states at a time",
         )
         parts = [load_episode(file)[0] for file in report.files]
-    rows: TensorDict = torch.cat(  # type: ignore[assignment]
-        [_transitions(part[_ROOT], key) for part in parts]  # type: ignore[arg-type]
-    )
+    rows: TensorDict = torch.cat([_transitions(part[_ROOT], key) for part in parts])
     lengths = torch.from_numpy(np.concatenate([part["lengths"] for part in parts]))
     rows["episode"] = torch.arange(len(lengths)).repeat_interleave(lengths)
     if path is None:
@@ -228,7 +225,7 @@ def random_episodes(
         :func:`~torchrl_caiac.data.collect.record_episode` returns it.
 
     Raises:
-        ValueError: the bounds of the actions are not finite.
+        ValueError: the action space is not a box, or its bounds are not finite.
 
     Examples:
         >>> import numpy as np
@@ -242,6 +239,10 @@ def random_episodes(
         (3, 4)
     """
     space = env.action_space
+    if not (hasattr(space, "low") and hasattr(space, "high")):
+        raise ValueError(
+            f"the action space is {space}, expected a box: uniform actions need bounds"
+        )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise ValueError(
             f"the bounds of the actions are {space.low} and {space.high}, expected "

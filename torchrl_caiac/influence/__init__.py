@@ -5,6 +5,10 @@ from __future__ import annotations
 from torchrl_caiac.influence.action_coverage import ActionCoverage, action_coverage
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI
+from torchrl_caiac.influence.default_world_model import (
+    DEFAULT_FIT,
+    default_world_model,
+)
 from torchrl_caiac.influence.distance import DistanceInfluence
 from torchrl_caiac.influence.metrics import (
     EntityReport,
@@ -31,6 +35,7 @@ from torchrl_caiac.influence.truth import (
 
 __all__ = [
     "CAI",
+    "DEFAULT_FIT",
     "ActionCoverage",
     "AttentionInfluence",
     "DistanceInfluence",
@@ -44,6 +49,7 @@ __all__ = [
     "action_coverage",
     "best_threshold",
     "causal_action_influence",
+    "default_world_model",
     "influence_report",
     "oracle_score",
     "roc_auc",

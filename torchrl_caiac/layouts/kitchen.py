@@ -36,7 +36,7 @@ _OBJECTS = (
         "orientation, quaternion wxyz", 4, "kettle", _FLOOR, is_goal=True, is_unit=True
     ),
 )
-_GOALS = "The goal contains the configurations of all objects, 21 columns. "
+_GOALS = "The goal contains the configurations of all objects, 21 columns."
 
 _POSITIONS = LayoutDescription(
     "kitchen/positions",
@@ -63,7 +63,7 @@ _FRANKA = LayoutDescription(
     ("robot",),
     "The observation of FrankaKitchen-v1. "
     + _GOALS
-    + "Goals of FrankaKitchen-v1 are one entry for each task: leave 'achieved_goal' "
+    + " Goals of FrankaKitchen-v1 are one entry for each task: leave 'achieved_goal' "
     "and 'desired_goal' out of the data, goals are then read from later states.",
 )
 

@@ -115,6 +115,8 @@ def draw_scores(
     Returns:
         str: the ``<svg>`` element.
     """
+    # As the transform compares them: in the dtype of the scores.
+    threshold = float(np.asarray(threshold, dtype=scores.dtype))
     values = scores.astype(np.float64)
     positive = values[values > 0]
     rest = int((values <= 0).sum())

@@ -8,6 +8,7 @@ from typing import Any
 
 import torchrl_caiac
 from torchrl_caiac.report.contents import ReportContents, ReportSettings
+from torchrl_caiac.report.svg import printable
 from torchrl_caiac.report.swaps import CELLS, PLANE
 from torchrl_caiac.scored import ScoredDataset
 
@@ -39,11 +40,12 @@ def page_text(
         str: one self-contained page.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
+    from markupsafe import Markup, escape
 
     environment = Environment(
         loader=FileSystemLoader(_FOLDER),
         autoescape=True,  # names come from the dataset
+        finalize=_finalized,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -61,7 +63,7 @@ def page_text(
         svg=Markup,  # what this package drew, already escaped
         cells=CELLS,
         plane=PLANE,
-        code=usage_code(scored),
+        code=escape(usage_code(scored)),
         source_rows=settings_rows(scored.source),
         setting_rows=settings_rows(scored.settings),
         coverage_rows=settings_rows(scored.coverage or {}),
@@ -69,8 +71,13 @@ def page_text(
     return text.strip() + "\n"
 
 
+def _finalized(value: Any) -> Any:
+    # A Markup is a str, too; its texts are printable already, and it has line breaks.
+    return printable(value) if type(value) is str else value
+
+
 def share_text(share: float) -> str:
-    """Returns a share in percent, never rounded to nothing or everything.
+    r"""Returns a share in percent, never rounded to nothing or everything.
 
     Args:
         share (float): in [0, 1].
@@ -80,8 +87,12 @@ def share_text(share: float) -> str:
 
     Examples:
         >>> from torchrl_caiac.report.page import share_text
-        >>> share_text(0.0), share_text(0.0001), share_text(0.1234), share_text(0.9999)
-        ('0 %', '< 0.1 %', '12.3 %', '> 99.9 %')
+        >>> for share in (0.0, 0.0001, 0.1234, 0.9999):
+        ...     print(share_text(share).replace("\N{NO-BREAK SPACE}", " "))
+        0 %
+        < 0.1 %
+        12.3 %
+        > 99.9 %
     """
     if share in (0, 1):
         return f"{100 * share:.0f}\N{NO-BREAK SPACE}%"

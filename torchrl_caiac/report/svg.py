@@ -21,6 +21,7 @@ __all__ = [
     "MUTED",
     "RECORDED",
     "drawing",
+    "printable",
     "short_label",
     "svg_text",
 ]
@@ -100,12 +101,31 @@ def short_label(name: str, most: int = 34) -> str:
         >>> short_label("left_gripper_finger", 10)
         'left_…nger'
     """
-    # Control characters are not allowed in XML.
-    text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
+    text = " ".join(printable(name).split()) or " "
     if len(text) <= most:
         return text
     tail = (most - 1) // 2
     return text[: most - 1 - tail] + "…" + text[-tail:]
+
+
+def printable(text: str) -> str:
+    """Returns text without control characters, which XML does not allow.
+
+    Args:
+        text (str): the text.
+
+    Returns:
+        str: the text, with spaces for line breaks and tabs.
+
+    Examples:
+        >>> from torchrl_caiac.report.svg import printable
+        >>> printable("two\\nlines")
+        'two lines'
+    """
+    return "".join(
+        c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}"
+        for c in text
+    )
 
 
 def svg_text(figure: Figure, name: str, description: str) -> str:
@@ -126,14 +146,19 @@ def svg_text(figure: Figure, name: str, description: str) -> str:
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     ElementTree.register_namespace("", _SVG)
     root = ElementTree.fromstring(buffer.getvalue())
-    for child in list(root):
-        if child.tag == f"{{{_SVG}}}metadata":
-            root.remove(child)
+    for parent in list(root.iter()):
+        for child in list(parent):
+            # A style sheet in the page would be one for the whole page.
+            if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"):
+                parent.remove(child)
     used = _references(root)
     for element in root.iter():
         link = element.attrib.pop(f"{{{_XLINK}}}href", None)
         if link is not None:
             element.set("href", f"#{name}-{link[1:]}" if link[0] == "#" else link)
+        element.tail = None  # white space
+        if not (element.text or "").strip():
+            element.text = None
         own = element.attrib.pop("id", None)
         if own in used:
             element.set("id", f"{name}-{own}")
@@ -147,7 +172,8 @@ def svg_text(figure: Figure, name: str, description: str) -> str:
     root.attrib.pop("version", None)
     root.set("viewBox", f"0 0 {width.rstrip('pt')} {height.rstrip('pt')}")
     root.set("role", "img")
-    root.set("aria-label", description)
+    root.set("aria-label", printable(description))
+    root.set("style", "stroke-linejoin: round")
     text = ElementTree.tostring(root, encoding="unicode", short_empty_elements=True)
     text = text.replace(f' xmlns="{_SVG}"', "")  # HTML knows it
     return text.strip()
@@ -168,4 +194,5 @@ def _adapted(text: str, name: str) -> str:
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, variable)
     text = re.sub(r"font: (?:\w+ )*?([\d.]+)px [^;]*", r"font-size: \1px", text)
+    text = re.sub(r"font-family: [^;]*;? ?", "", text)
     return text.replace("url(#", f"url(#{name}-")

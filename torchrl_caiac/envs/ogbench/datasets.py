@@ -43,6 +43,9 @@ _STACKING = {
 }
 # Metres by which a cube may leave the workspace before an episode is drawn again.
 _OUTSIDE = 0.2
+# In the scene, where a cube can be seen: between the walls, or in the drawer.
+_SCENE_SIDES = (-0.3, 0.29)
+_DRAWER_HEIGHTS = (0.06, 0.08)
 # The noise on positions, yaw and gripper of a noisy episode, relative to its level.
 _NOISE = np.array([1.0, 1.0, 1.0, 3.0, 10.0])
 
@@ -214,7 +217,7 @@ class _Source:
             rows["qvel"].append(info["prev_qvel"])
             if "prev_" + _BUTTONS in info:
                 rows[_BUTTONS].append(info["prev_" + _BUTTONS])
-            if self._outside(info):
+            if self._is_lost(info):
                 return None
             if oracle.done:
                 observation, info = simulation.set_new_target(p_stack=stacking)
@@ -230,14 +233,25 @@ class _Source:
         oracle.reset(observation, info)
         return oracle
 
-    def _outside(self, info: Mapping[str, Any]) -> bool:
-        """Returns whether a cube has been thrown out, as instabilities rarely do."""
+    def _is_lost(self, info: Mapping[str, Any]) -> bool:
+        """Returns whether a cube has been thrown out, or cannot be seen in the scene.
+
+        OGBench draws such an episode again too.
+        """
         low, high = self.env.unwrapped._workspace_bounds
-        cubes = [v for k, v in info.items() if k.endswith("_pos") and "/block_" in k]
-        return any(
-            bool((cube < low - _OUTSIDE).any() or (cube > high + _OUTSIDE).any())
-            for cube in cubes
-        )
+        for key, cube in info.items():
+            if not (key.startswith("privileged/block_") and key.endswith("_pos")):
+                continue
+            if (cube < low - _OUTSIDE).any() or (cube > high + _OUTSIDE).any():
+                return True
+            if self.name == "scene":
+                left, right = _SCENE_SIDES
+                bottom, top = _DRAWER_HEIGHTS
+                if cube[1] >= right or (
+                    cube[1] <= left and not bottom <= cube[2] <= top
+                ):
+                    return True
+        return False
 
     def close(self) -> None:
         self.env.close()

@@ -1,0 +1,62 @@
+"""The world model and its fit that suit most data, for CAI."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tensordict.utils import NestedKey
+
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
+
+__all__ = ["DEFAULT_FIT", "default_world_model"]
+
+#: Settings of :func:`~torchrl_caiac.fit.fit_world_model`: two minutes on one processor.
+DEFAULT_FIT = {"steps": 20_000, "batch_size": 500, "lr": 8e-4, "eval_every": 1_000}
+
+
+def default_world_model(
+    layout: EntityLayout,
+    action_dim: int,
+    *,
+    widths: Mapping[str, int] | None = None,
+    action_key: NestedKey = "action",
+) -> GaussianWorldModel:
+    """Creates a world model for :class:`~torchrl_caiac.influence.CAI`, not fitted.
+
+    It predicts the positions of the entities alone, if ``layout.positions`` names them:
+    what does not move in space has no influence that matters, and velocities, contacts
+    and rotations are harder to predict. Its variance floor is that of the layout or, if
+    that has none, comes from the noise in the data. Fit it with
+    ``fit_world_model(model, data, **DEFAULT_FIT)``.
+
+    Args:
+        layout (EntityLayout): the entities.
+        action_dim (int): the size ``A`` of the action.
+
+    Keyword Args:
+        widths (Mapping of str to int, optional): the number of features of each entity,
+            ``layout.widths(td)``. Required for nested layouts only.
+        action_key (NestedKey): the action. Defaults to ``"action"``.
+
+    Returns:
+        GaussianWorldModel: the model, with three hidden layers of 256.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.influence import default_world_model
+        >>> layout = EntityLayout(
+        ...     {"arm": [0, 1, 2], "cup": [3, 4]}, positions={"arm": [0, 1], "cup": [3]}
+        ... )
+        >>> model = default_world_model(layout, action_dim=2)
+        >>> model.config["predict"], model.config["variance_floor"]
+        ({'arm': [0, 1], 'cup': [3]}, 'auto')
+    """
+    return GaussianWorldModel(
+        layout,
+        action_dim,
+        predict=layout.positions,
+        widths=widths,
+        action_key=action_key,
+        variance_floor=None if layout.variance_floor else "auto",
+    )
