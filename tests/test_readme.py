@@ -25,7 +25,12 @@ from torchrl_caiac.evaluation import (
     Candidate,
     compare_influence,
 )
-from torchrl_caiac.influence import CAI, AttentionInfluence, score_buffer
+from torchrl_caiac.influence import (
+    CAI,
+    AttentionInfluence,
+    MotionInfluence,
+    score_buffer,
+)
 from torchrl_caiac.modules import (
     GaussianWorldModel,
     GoalConditionedActor,
@@ -152,6 +157,15 @@ def scored(flat_data: TensorDictBase) -> TensorDictBase:
     """Returns the shared trajectories with scores: nothing is influenced."""
     flat_data["caiac", "score"] = torch.zeros(len(flat_data), 3)
     return flat_data
+
+
+def test_motion_as_the_estimator(scored: TensorDictBase) -> None:
+    rb = offline_buffer(scored.exclude("caiac"), batch_size=8)
+    scope = run_usage(
+        "estimator = MotionInfluence", rb=rb, MotionInfluence=MotionInfluence
+    )
+    assert rb.storage[:]["caiac", "score"].shape == (len(scored), 3)
+    assert scope["estimator"].fitted
 
 
 in_memory = pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)
