@@ -159,16 +159,17 @@ def scored(flat_data: TensorDictBase) -> TensorDictBase:
     return flat_data
 
 
-def test_motion_as_the_estimator(scored: TensorDictBase) -> None:
-    rb = offline_buffer(scored.exclude("caiac"), batch_size=8)
+in_memory = pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)
+
+
+@in_memory
+def test_motion_as_the_estimator(flat_data: TensorDictBase) -> None:
+    rb = offline_buffer(flat_data, batch_size=8)
     scope = run_usage(
         "estimator = MotionInfluence", rb=rb, MotionInfluence=MotionInfluence
     )
-    assert rb.storage[:]["caiac", "score"].shape == (len(scored), 3)
+    assert rb.storage[:]["caiac", "score"].shape == (len(flat_data), 3)
     assert scope["estimator"].fitted
-
-
-in_memory = pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)
 
 
 @in_memory
