@@ -78,14 +78,6 @@ class Environment(ABC):
         return Bounded(-1.0, 1.0, (self.action_dim,))
 
     @property
-    def positions_layout(self) -> EntityLayout:
-        """The layout with the predicted columns as the positions of the entities."""
-        content = self.layout.to_dict()
-        if self.predicted is not None:
-            content["positions"] = [[n, list(c)] for n, c in self.predicted.items()]
-        return EntityLayout.from_dict(content)
-
-    @property
     def folder(self) -> Path:
         """The folder of everything that depends on the training data."""
         return self.out

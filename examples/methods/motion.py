@@ -34,4 +34,4 @@ class Motion(CAIAC):
 
     def estimator(self, scoring: Scoring) -> Estimator:
         """Returns the motion of the positions."""
-        return MotionInfluence(scoring.environment.positions_layout, self.tolerance)
+        return MotionInfluence(scoring.environment.layout, self.tolerance)

@@ -28,6 +28,6 @@ class Residual(Motion):
     def estimator(self, scoring: Scoring) -> Estimator:
         """Returns the residual, after fitting it to the rows."""
         estimator = ResidualInfluence(
-            scoring.environment.positions_layout, self.tolerance, far=self.far
+            scoring.environment.layout, self.tolerance, far=self.far
         )
         return estimator.fit(scoring.environment.rows(), progress=scoring.progress)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchrl_caiac._files import UnreadableFileError, whole_folder
+from torchrl_caiac.data.collect import collection_folder
 from torchrl_caiac.data.minari_checks import check_metadata
 
 if TYPE_CHECKING:
@@ -171,11 +171,9 @@ def work_folder(work: str | os.PathLike[str] | None, dataset_id: str) -> Iterato
         ...     folder.as_posix()
         '/work/push-play-v0'
     """
-    if work is not None:
-        yield Path(work) / dataset_id.replace("/", "-")
-        return
-    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
-        yield Path(folder)
+    own = None if work is None else Path(work) / dataset_id.replace("/", "-")
+    with collection_folder(own) as folder:
+        yield folder
 
 
 def publish_dataset(
