@@ -12,7 +12,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo fetch-push influence bench docs clean
+.PHONY: help setup test lint demo fetch-push influence thresholds bench docs clean
 
 # A stamp without its interpreter (moved folder, removed Python) does not count.
 ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
@@ -64,6 +64,13 @@ influence: setup ## compare influence estimators (QUICK=1: a smoke run)
 	@for env in fetch_push kitchen kitchen_all_tasks; do \
 	    $(BIN)/python examples/compare_influence.py env=$$env \
 	        publish=$(INFLUENCE) $(SIZE); done
+
+thresholds: setup ## compare suggested thresholds with the best ones
+	@for env in fetch_push kitchen kitchen_all_tasks; do \
+	    $(BIN)/python examples/suggest_thresholds.py env=$$env \
+	        publish=$(INFLUENCE) $(SIZE); done
+	$(BIN)/python examples/suggest_thresholds_ogbench.py --out outputs/ogbench \
+	    --publish $(INFLUENCE)
 
 bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'

@@ -37,6 +37,7 @@ def make_gaussian(environment: Environment, settings: DictConfig) -> GaussianWor
         environment.predicted,
         variance_floor=settings.variance_floor,
         spectral_norm=settings.spectral_norm,
+        inputs=environment.inputs,
     )
 
 
@@ -52,6 +53,7 @@ def make_transformer(
         settings.width,
         environment.predicted,
         variance_floor=settings.variance_floor,
+        inputs=environment.inputs,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,12 @@ from torchrl.data import TensorStorage
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.checkpoint import TrainingCheckpoint
-from torchrl_caiac.data import action_bounds, load_episode, load_transitions
+from torchrl_caiac.data import (
+    action_bounds,
+    load_episode,
+    load_transitions,
+    open_dataset,
+)
 from torchrl_caiac.data.digests import verify_digests, write_digests
 from torchrl_caiac.data.minari_files import open_minari
 from torchrl_caiac.envs import load_d4rl_kitchen
@@ -168,10 +174,44 @@ def d4rl(folder: Path, evil: Payload) -> Callable[[], Any]:
     return lambda: load_d4rl_kitchen(folder / "kitchen.hdf5")
 
 
+def ogbench(folder: Path, evil: Payload) -> Callable[[], Any]:
+    file, rows = folder / "cube-single-play-v0.npz", np.zeros((3, 5))
+    evils = np.array([evil] * 3, dtype=object)
+    np.savez(file, observations=rows, actions=rows, terminals=[0, 0, 1], qpos=evils)
+    return lambda: open_dataset(file, folder / "rows")
+
+
+def array_file(folder: Path, evil: Payload) -> Callable[[], Any]:
+    file, rows = folder / "rows.npz", np.zeros((3, 5))
+    np.savez(file, observations=rows, actions=rows, timeouts=np.array(evil))
+    return lambda: open_dataset(file, folder / "rows")
+
+
+def robomimic(folder: Path, evil: Payload) -> Callable[[], Any]:
+    with h5py.File(folder / "lift.hdf5", "w") as stored:
+        stored["data/demo_0/obs/object"] = np.zeros((3, 5))
+        stored["data/demo_0/actions"] = np.void(pickle.dumps(evil))
+    return lambda: open_dataset(folder / "lift.hdf5", folder / "rows")
+
+
+def lerobot(folder: Path, evil: Payload) -> Callable[[], Any]:
+    shutil.copytree(ROOT / "tests/data/lerobot/v2.1", folder / "push")
+    for file in folder.rglob("episode_000001.parquet"):
+        file.write_bytes(pickle.dumps(evil))
+    return lambda: open_dataset(folder / "push", folder / "rows", progress=False)
+
+
+def lerobot_description(folder: Path, evil: Payload) -> Callable[[], Any]:
+    shutil.copytree(ROOT / "tests/data/lerobot/v2.1", folder / "push")
+    (folder / "push/meta/info.json").write_bytes(pickle.dumps(evil))
+    return lambda: open_dataset(folder / "push", folder / "rows")
+
+
 READERS = [
     transitions, meta_json, leaf, digests, bounds, episode, episode_as_pickle,
     layout, score_record, checkpoint, checkpoint_as_pickle,
     fitted_model, minari_metadata, minari_as_pickle, d4rl,
+    ogbench, array_file, robomimic, lerobot, lerobot_description,
 ]  # fmt: skip
 
 

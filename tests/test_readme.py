@@ -25,7 +25,12 @@ from torchrl_caiac.evaluation import (
     Candidate,
     compare_influence,
 )
-from torchrl_caiac.influence import CAI, AttentionInfluence, score_buffer
+from torchrl_caiac.influence import (
+    CAI,
+    AttentionInfluence,
+    MotionInfluence,
+    score_buffer,
+)
 from torchrl_caiac.modules import (
     GaussianWorldModel,
     GoalConditionedActor,
@@ -66,6 +71,25 @@ def make_dataset(name: str, episodes: int = 4, steps: int = 30) -> None:
         observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (34,), np.float32),
         action_space=gymnasium.spaces.Box(-1, 1, (4,), np.float32),
     )
+
+
+def test_from_arrays_to_a_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    readme = (ROOT / "README.md").read_text()
+    (code,) = [b for b in python_blocks(readme) if "MotionInfluence(" in b]
+    lines = [x for x in code.splitlines() if x.strip() and not x.startswith("#")]
+    assert len(lines) <= 15
+    (shown,) = re.findall(r"```text\ntensor\(\[ *0, *(\d+)\]\)\n```", readme)
+    counts = []
+    for _ in range(2):  # the second run opens what the first one wrote
+        exec(compile(code, "README.md", "exec"), {})
+        printed = capsys.readouterr().out
+        counts += re.findall(r"^tensor\(\[ *0, *(\d+)\]\)$", printed, re.MULTILINE)
+    assert len(counts) == 2
+    for count in (int(shown), *map(int, counts)):
+        assert 85 <= count <= 118  # about 0.8 of 128, the cups that nothing carries
 
 
 def test_bring_your_own_dataset(
@@ -133,6 +157,15 @@ def scored(flat_data: TensorDictBase) -> TensorDictBase:
     """Returns the shared trajectories with scores: nothing is influenced."""
     flat_data["caiac", "score"] = torch.zeros(len(flat_data), 3)
     return flat_data
+
+
+def test_motion_as_the_estimator(scored: TensorDictBase) -> None:
+    rb = offline_buffer(scored.exclude("caiac"), batch_size=8)
+    scope = run_usage(
+        "estimator = MotionInfluence", rb=rb, MotionInfluence=MotionInfluence
+    )
+    assert rb.storage[:]["caiac", "score"].shape == (len(scored), 3)
+    assert scope["estimator"].fitted
 
 
 in_memory = pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)

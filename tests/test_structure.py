@@ -15,6 +15,7 @@ LAYERS = [
     {
         "_buffer_transform",
         "_columns",
+        "_figures",
         "_files",
         "_fingerprints",
         "_keys",
@@ -45,7 +46,9 @@ LAYERS = [
     {"influence"},
     {"transforms"},
     {"evaluation"},
-    {"_figures", "plotting"},
+    {"plotting"},
+    {"augment", "inspection", "report", "scored"},
+    {"__main__", "cli"},
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
 __all__ = [
     "GREY",
@@ -16,6 +19,7 @@ __all__ = [
     "name_label",
     "new_figure",
     "remove_frame",
+    "true_ranges",
 ]
 
 # The palette of Okabe and Ito, safe for colour-blind readers, without its yellow.
@@ -98,6 +102,25 @@ def name_label(name: str) -> str:
         'slide cabinet'
     """
     return name.replace("_", " ")
+
+
+def true_ranges(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Returns the half-open ranges in which a mask is true.
+
+    Args:
+        mask (numpy.ndarray): bool ``[L]``.
+
+    Returns:
+        list of tuple of int: the first place of each range and the one after its last.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_caiac._figures import true_ranges
+        >>> true_ranges(np.array([True, True, False, True]))
+        [(0, 2), (3, 4)]
+    """
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def finish_results(

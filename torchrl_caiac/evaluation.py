@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_caiac.data.offline_buffer import offline_buffer
+from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.metrics import influence_report
 from torchrl_caiac.influence.score_buffer import score_buffer
 
@@ -181,7 +182,8 @@ def compare_influence(
         list of dict: for each estimator one row with ``"entity": "all"`` and one for
         each entity that is not fixed, in the columns :data:`COLUMNS`:
 
-        - ``"estimator"`` and ``"threshold"``, θ;
+        - ``"estimator"`` and ``"threshold"``, θ; for all entities NaN if each has its
+          own;
         - ``"auc"``, ``"true_positive_rate"``, ``"false_positive_rate"`` and
           ``"best_threshold"`` of the influence of the action, see
           :class:`~torchrl_caiac.influence.EntityReport`; for all entities, the mean
@@ -215,6 +217,12 @@ def compare_influence(
     for name, candidate in candidates.items():
         transform = candidate.transform
         layout, theta = transform.layout, transform.threshold
+        thetas = transform.thresholds
+        if theta == "auto" and not thetas:
+            raise ValueError(
+                f"the transform of {name!r} has threshold='auto', and no numbers yet: "
+                "give numbers, such as suggest_thresholds(...).thresholds"
+            )
         rb = offline_buffer(data.clone(), batch_size=1)
         begin = _cpu_seconds()
         score_buffer(
@@ -234,14 +242,15 @@ def compare_influence(
                 scores if scores.ndim == 2 else scores[:, -1],
                 influenced,
                 layout.names,
-                threshold=theta,
+                threshold=theta if isinstance(theta, float) else thetas,
             )
         )
         swaps = swap_shares(transform, scores, influenced, seed=seed)
-        common = {"estimator": name, "threshold": theta}
+        common = {"estimator": name}
         entities: list[dict[str, Any]] = [
             {
                 **common,
+                "threshold": thetas[entity],
                 "entity": entity,
                 **{key: report[entity][key] for key in _RATES},
                 "infeasible": swaps.infeasible[layout.index(entity)].item(),
@@ -253,13 +262,14 @@ def compare_influence(
         rows.append(
             {
                 **common,
+                "threshold": theta if isinstance(theta, float) else math.nan,
                 "entity": "all",
                 **{
                     key: fmean(row[key] for row in with_auc) if with_auc else math.nan
                     for key in _RATES
                 },
                 "infeasible": swaps.infeasible_total,
-                "density": _density(scores, layout.fixed_mask, theta),
+                "density": _density(scores, layout, thetas),
                 "rows_swapped": swaps.rows,
                 "fit_seconds": candidate.fit_seconds,
                 "score_seconds": seconds,
@@ -274,11 +284,19 @@ def _cpu_seconds() -> float:
     return time.process_time() + sum(os.times()[2:4])
 
 
-def _density(scores: torch.Tensor, fixed: torch.Tensor, threshold: float) -> float:
-    """Returns the share of scored links above the threshold."""
+def _density(
+    scores: torch.Tensor, layout: EntityLayout, thresholds: Mapping[str, float]
+) -> float:
+    """Returns the share of scored links above the thresholds."""
+    fixed = layout.fixed_mask
+    # Fixed entities have no threshold of their own, but their links in graphs count:
+    # graphs have one threshold for all.
+    some = next(iter(thresholds.values()), 0.0)
+    limits = torch.tensor([thresholds.get(name, some) for name in layout.names])
+    above = scores > limits.to(scores.device, scores.dtype)
     if scores.ndim == 2:  # without fixed entities, which the action always influences
         scored = (~fixed).expand_as(scores)
     else:  # without the links from an entity to itself
         n = scores.shape[-1]
         scored = (~torch.eye(n + 1, n, dtype=torch.bool)).expand_as(scores)
-    return (scores[scored] > threshold).double().mean().item()
+    return above[scored].double().mean().item()

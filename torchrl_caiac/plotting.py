@@ -19,6 +19,7 @@ from torchrl_caiac._figures import (
     name_label,
     new_figure,
     remove_frame,
+    true_ranges,
 )
 
 if TYPE_CHECKING:
@@ -187,7 +188,7 @@ def plot_influence(
             label=name_label(names[i]),
             zorder=3,
         )
-        for a, b in [] if contact is None else _runs(contact[:, i]):
+        for a, b in [] if contact is None else true_ranges(contact[:, i]):
             axes.axvspan(
                 time[a] - pitch / 2,
                 time[a] + (b - a - 0.5) * pitch,
@@ -235,7 +236,7 @@ def plot_influence(
             strip.broken_barh(
                 [
                     (time[a] - pitch / 2, (b - a) * pitch)
-                    for a, b in _runs(contact[:, i])
+                    for a, b in true_ranges(contact[:, i])
                 ],
                 (row + 0.12, 0.76),
                 facecolors=colours[i],
@@ -252,12 +253,6 @@ def plot_influence(
         last = strip
     last.set_xlabel("step" if step_seconds is None else "time (s)")
     return figure
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Returns the half-open ranges in which a mask is true."""
-    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 # The title, the columns (which are summed) and the axis of each panel.

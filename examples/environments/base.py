@@ -56,6 +56,8 @@ class Environment(ABC):
     action_dim: int
     predicted: Mapping[str, Sequence[int]] | None = None
     """The columns that world models predict; ``None`` for all."""
+    inputs: Mapping[str, Sequence[int]] | None = None
+    """The columns that world models read; ``None`` for all."""
     goal_reference: str | None = None
     """The entity that positions are given relative to; ``None`` for none."""
     reward_fn: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,13 @@ class FetchPush(Environment):
         """The folder of the fraction of the data."""
         return self.out / f"fraction-{self.settings.fraction:g}"
 
+    @property
+    def cubes(self) -> dict[str, float]:
+        """How the cubes differ from those of Fetch-Push, if they do."""
+        settings = self.settings.collect
+        names = ("cube_friction", "cube_speed")
+        return {name: settings[name] for name in names if name in settings}
+
     def collect(self, *, progress: bool = False) -> None:
         """Collects what is missing of the datasets, and mixes the transitions."""
         settings, out = self.settings.collect, self.out
@@ -72,6 +80,7 @@ class FetchPush(Environment):
                 continue
             dataset = MAKERS[name.removeprefix("held_out_")](
                 f"fetch-push-2/{name.replace('_', '-')}-v0",
+                **self.cubes,
                 episodes=episodes,
                 steps=settings.steps,
                 root=out / "minari",
@@ -109,7 +118,7 @@ class FetchPush(Environment):
     def simulator(self, num_actions: int) -> SimulatorInfluence:
         """Returns the simulator as an estimator."""
         return SimulatorInfluence(
-            FetchPushTruth,
+            partial(FetchPushTruth, 2, self.cubes.get("cube_friction")),
             state_key=("info", "simulator"),
             num_actions=num_actions,
             threshold=self.settings.truth.threshold,
@@ -130,6 +139,7 @@ class FetchPush(Environment):
             episodes=settings.episodes,
             steps=self.settings.collect.steps,
             seed=settings.seed,
+            **self.cubes,
         )
 
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
@@ -184,7 +194,9 @@ class FetchPush(Environment):
         return f"both cubes at their goals: {compare_methods(shares)}"
 
 
-def play(actor: Any, *, episodes: int, steps: int, seed: int) -> list[dict[str, bool]]:
+def play(
+    actor: Any, *, episodes: int, steps: int, seed: int, **cubes: float
+) -> list[dict[str, bool]]:
     """Plays episodes in parallel, from the starts that the seed determines.
 
     Returns:
@@ -192,7 +204,8 @@ def play(actor: Any, *, episodes: int, steps: int, seed: int) -> list[dict[str, 
         step (``full``) and at the last one (``final``), and whether each cube was at
         some step.
     """
-    envs = [FetchPushCubes(2, max_episode_steps=steps) for _ in range(episodes)]
+    make = partial(FetchPushCubes, 2, max_episode_steps=steps, **cubes)
+    envs = [make() for _ in range(episodes)]
     states = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
     reached = np.zeros((steps, episodes, 2), dtype=np.bool_)
     keys = [key for key in actor.in_keys if key in states[0]]

@@ -52,6 +52,8 @@ class Method(ABC):
     """Its name in figures; empty for the name in the configuration."""
     models: ClassVar[tuple[str, ...]] = ()
     """The world models that are fitted for it."""
+    fits_itself: ClassVar[bool] = False
+    """Whether :meth:`estimator` fits something that takes time."""
     score_key: ClassVar[NestedKey | None] = None
     """The leaf of its scores; ``None`` where it needs none."""
 

@@ -22,6 +22,7 @@ def update_csv(
     columns: Sequence[str],
     *,
     experiment: str,
+    kept: str | None = None,
 ) -> list[dict[str, str]]:
     """Writes the rows of one experiment into a table that several share.
 
@@ -33,6 +34,8 @@ def update_csv(
 
     Keyword Args:
         experiment (str): the experiment of the rows, which replace its earlier ones.
+        kept (str, optional): a column. Earlier rows of the experiment whose value in
+            it the new rows do not have are kept. Defaults to ``None``: none are kept.
 
     Returns:
         list of dict: all rows of the file, as strings.
@@ -61,10 +64,13 @@ def update_csv(
                 )
             for row in reader:
                 table.setdefault(row["experiment"], []).append(row)
-    table[experiment] = [
+    new = [
         {"experiment": experiment, **{name: _cell(row.get(name)) for name in columns}}
         for row in rows
     ]
+    replaced = {row[kept] for row in new} if kept else set()
+    old = table.get(experiment, []) if kept else []
+    table[experiment] = [row for row in old if row[kept] not in replaced] + new
     written = [row for part in table.values() for row in part]
     with whole_file(path) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, names, lineterminator="\n")
@@ -88,7 +94,8 @@ def publish_comparison(
     """Writes a comparison to ``influence.csv``, and draws ``influence.png``.
 
     ``influence.txt`` has the rows over all entities in a table to read. Several
-    experiments share the files: each call replaces the rows of its own.
+    experiments share the files: each call replaces the rows of its own experiment
+    and estimators.
 
     Args:
         folder (path): the folder of the files.
@@ -98,7 +105,11 @@ def publish_comparison(
         experiment (str): the name of the data, the table's first column.
     """
     table = update_csv(
-        Path(folder) / "influence.csv", rows, COLUMNS, experiment=experiment
+        Path(folder) / "influence.csv",
+        rows,
+        COLUMNS,
+        experiment=experiment,
+        kept="estimator",
     )
     with whole_file(Path(folder) / "influence.txt") as partial:
         partial.write_text(_table(table))

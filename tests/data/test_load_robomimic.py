@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
 
 import h5py
 import numpy as np
 import pytest
 
-from torchrl_caiac.data import UnreadableFileError, load_robomimic
+from torchrl_caiac.data import UnreadableFileError, action_bounds, load_robomimic
 from torchrl_caiac.data.digests import data_source
 
 LENGTHS = {"demo_0": 5, "demo_2": 4, "demo_10": 3}
@@ -148,6 +151,62 @@ def test_the_environment_is_a_remark(file):
     assert data_source(file.with_name("rows"))["env_name"] == "Lift"
 
 
+CONTROLLER = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "kp": 150}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"controller_configs": CONTROLLER},  # of robosuite 1.4
+        {"controller_configs": {"type": "BASIC", "body_parts": {"right": CONTROLLER}}},
+        {"controller_configs": {"input_max": [1.0] * 6, "input_min": [-1.0] * 6}},
+    ],
+)
+def test_bounds_of_actions_are_those_of_the_controllers(tmp_path, settings):
+    def edit(file):
+        args = {"env_name": "Lift", "type": 1, "env_kwargs": settings}
+        file["data"].attrs["env_args"] = json.dumps(args)
+
+    load(write(tmp_path / "a.hdf5", edit=edit))
+    low, high = action_bounds(tmp_path / "rows")
+    assert low.tolist() == [-1] * 7 and high.tolist() == [1] * 7
+
+
+@pytest.mark.parametrize("change", [None, "limits", "actions", "text"])
+def test_bounds_that_are_not_sure_are_unknown(tmp_path, change, caplog):
+    def edit(file):
+        controllers = {"left": CONTROLLER, "right": CONTROLLER}
+        if change == "limits":
+            controllers["left"] = {"input_max": 0.5, "input_min": -0.5}
+        if change == "actions":
+            file["data/demo_2/actions"][1, 3] = 1.5
+        args = json.dumps({"env_kwargs": {"controller_configs": controllers}})
+        if change is not None:
+            text = args[:10] if change == "text" else args
+            file["data"].attrs["env_args"] = text
+
+    load(write(tmp_path / "a.hdf5", edit=edit))
+    assert action_bounds(tmp_path / "rows") is None
+    said = "but the actions of demo_2 are outside" in caplog.text
+    assert said == (change == "actions")
+
+
+def test_a_last_observation_without_action_is_used(tmp_path, caplog):
+    def edit(file):
+        for name, length in LENGTHS.items():
+            group, parts = file["data"][name], demo(name, length)
+            del group["next_obs"]
+            for key in OBS:
+                del group[f"obs/{key}"]
+                group[f"obs/{key}"] = parts[key]
+
+    with caplog.at_level(logging.INFO, "torchrl_caiac"):
+        data = load(write(tmp_path / "a.hdf5", edit=edit))
+    assert "of each demonstration is left out" not in caplog.text
+    expected = stacked("object", slice(1, None)).astype("f")
+    assert np.array_equal(data["next", "observation", "object"], expected)
+
+
 def libero(file):
     """As LIBERO writes: observations after the actions, no next ones, uint8 rewards."""
     for name, length in LENGTHS.items():
@@ -217,6 +276,7 @@ def replaced(key, value):
         (None, {"infos": ["cup"]}, KeyError, "no 'cup', .*correct the file or infos="),
         (None, {"keys": ["agentview_image"]}, ValueError, "keys="),
         (None, {"keys": []}, ValueError, "at least one"),
+        (None, {"keys": ["object", "object"]}, ValueError, "an entry twice"),
         (None, {"keys": ["object"], "exclude": ["object"]}, ValueError, "do not apply"),
         (None, {"observed": "then"}, ValueError, "'then', expected 'before'"),
         (
@@ -309,3 +369,72 @@ def test_links_to_other_files_are_refused(tmp_path):
 
     with pytest.raises(UnreadableFileError, match=r"demo_2.*link"):
         load(write(tmp_path / "a.hdf5", edit=edit))
+
+
+@contextmanager
+def robosuite_on_this_mujoco() -> Iterator[None]:
+    """robosuite 1.5.1 computes inertias of its controllers as older MuJoCo did."""
+    import mujoco
+    from robosuite.utils import binding_utils
+
+    with pytest.MonkeyPatch.context() as patch:
+        inertia = lambda model, out, matrix: np.copyto(out, np.eye(len(out)))  # noqa: E731
+        patch.setattr(mujoco, "mj_fullM", inertia)
+        patch.setattr(binding_utils.MjData, "qM", None, raising=False)
+        yield
+
+
+@pytest.fixture(scope="module")
+def lift(tmp_path_factory):
+    """A file with two rollouts of robosuite's Lift, and the observations in them."""
+    import robosuite
+
+    def seen(observation):
+        kept = {"object": observation["object-state"]}
+        kept |= {k: v for k, v in observation.items() if k.startswith("robot0_")}
+        return {k: np.array(v) for k, v in kept.items() if "proprio" not in k}
+
+    file, random = (
+        tmp_path_factory.mktemp("lift") / "lift.hdf5",
+        np.random.default_rng(0),
+    )
+    rollouts = []
+    with robosuite_on_this_mujoco(), h5py.File(file, "w") as stored:
+        env = robosuite.make(
+            "Lift",
+            robots="Panda",
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+        )
+        for number, length in enumerate((4, 3)):
+            states, actions, simulator = [seen(env.reset())], [], []
+            for _ in range(length):
+                actions.append(random.uniform(-1, 1, env.action_dim))
+                simulator.append(env.sim.get_state().flatten())
+                states.append(seen(env.step(actions[-1])[0]))
+            group = stored.create_group(f"data/demo_{number}")
+            group["actions"], group["states"] = np.stack(actions), np.stack(simulator)
+            for key in states[0]:
+                group[f"obs/{key}"] = np.stack([state[key] for state in states[:-1]])
+                group[f"next_obs/{key}"] = np.stack([s[key] for s in states[1:]])
+            rollouts.append(states)
+        env.close()
+    return file, rollouts
+
+
+def test_rollouts_of_robosuite_are_read(lift, tmp_path):
+    file, rollouts = lift
+    keys = ["object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
+    data = load_robomimic(file, tmp_path / "a", progress=False, infos=["states"])
+    flat = load_robomimic(file, tmp_path / "b", progress=False, keys=keys)
+    assert flat["observation"].shape == (7, 10 + 3 + 4 + 2)
+    row = 0
+    for states in rollouts:
+        for now, after in pairwise(states):
+            for key, value in now.items():
+                leaf = data["observation", key][row].numpy()
+                assert np.array_equal(leaf, np.atleast_1d(value).astype("f"))
+            joined = np.concatenate([after[key] for key in keys]).astype("f")
+            assert np.array_equal(flat["next", "observation"][row], joined)
+            row += 1

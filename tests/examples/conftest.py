@@ -16,7 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study")
 SCRIPTS += ("compare_influence", "compare_precision")
-SHARED = ("console", "log", "parts", "settings", "tables")
+SCRIPTS += ("suggest_thresholds", "sweep_variance_floor")
+SHARED = ("console", "log", "parts", "settings", "tables", "thresholds")
 SMALL_ENV = {
     "kitchen": {
         "collect": {"episodes": 2, "held_out": 1},
@@ -33,6 +34,13 @@ SMALL_ENV = {
         "score": {"num_actions": 8},
         "truth": {"actions": 4, "oracle_actions": 3},
         "evaluate": {"episodes": 3, "last": 2, "curve_every": 4},
+    },
+    "ogbench_cube_double": {
+        "collect": {"episodes": 3, "steps": 40, "held_out": 2},
+        "world_model": {"steps": 60, "eval_every": 30, "hidden_sizes": [32]},
+        "transformer": {"steps": 10, "eval_every": 5, "layers": 1, "width": 16},
+        "score": {"num_actions": 8},
+        "truth": {"actions": 2},
     },
 }
 SMALL_ENV["kitchen_all_tasks"] = SMALL_ENV["kitchen"]

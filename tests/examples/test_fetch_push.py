@@ -391,22 +391,41 @@ def test_estimators_are_compared_on_unseen_episodes(
     steps.fit.fit(compared)
     with steps.console.Console(tmp_path, stages=4) as console:
         rows = steps.compare_influence.compare(compared, console)
-    names = ("caiac", "coda", "coda_action", "distance", "distance_action", "oracle")
+    names = ("caiac", "coda", "coda_action", "distance", "distance_action")
+    names += ("motion", "residual", "oracle")
     assert [(r["estimator"], r["entity"]) for r in rows] == [
         (name, entity) for name in names for entity in ("all", "cube0", "cube1")
     ]
     totals = {r["estimator"]: r for r in rows if r["entity"] == "all"}
     assert [totals[name]["threshold"] for name in names] == [
-        *(0.05, 0.2, 0.2, 0.5, 0.5, 0.5)
+        *(0.05, 0.2, 0.2, 0.5, 0.5, 0.5, 0.5, 0.5)
     ]
     # It simulates fewer of the same actions than the ground truth.
     assert totals["oracle"]["false_positive_rate"] == 0
     assert totals["oracle"]["rows_swapped"] > 0.9
     assert totals["coda"]["auc"] == pytest.approx(totals["coda_action"]["auc"])
-    for name in ("caiac", "coda", "coda_action"):
+    for name in ("caiac", "coda", "coda_action", "residual"):
         assert totals[name]["fit_seconds"] > 0
-    assert len((tmp_path / "influence.csv").read_text().splitlines()) == 19
+    assert len((tmp_path / "influence.csv").read_text().splitlines()) == 25
     assert environment.held_out().get("score", None) is None
+
+
+def test_suggested_thresholds_are_compared_with_the_best(
+    cfg, environment, steps, compose, tmp_path
+):
+    compared = compose("env=fetch_push", out=cfg.out, config="suggest_thresholds")
+    compared.publish = str(tmp_path)
+    with steps.console.Console(tmp_path, stages=4) as console:
+        rows = steps.suggest_thresholds.compare(compared, console)
+    assert {(r["estimator"], r["entity"]) for r in rows} >= {
+        ("caiac", "cube0"),
+        ("caiac", "cube1"),
+    }
+    for row in rows:
+        if row["confidence"] == "two clear modes":
+            assert row["loss"] >= 0
+    assert len((tmp_path / "thresholds.csv").read_text().splitlines()) == 1 + len(rows)
+    assert environment.held_out().get("suggested", None) is None
 
 
 def test_a_run_that_another_process_has_begun(cfg, steps):

@@ -161,7 +161,8 @@ def test_estimators_are_compared_on_unseen_demonstrations(
     compared.publish = str(tmp_path)
     with steps.console.Console(tmp_path, stages=4) as console:
         rows = steps.compare_influence.compare(compared, console)
-    names = ("caiac", "coda", "coda_action", "distance", "distance_action", "oracle")
+    names = ("caiac", "coda", "coda_action", "distance", "distance_action")
+    names += ("motion", "residual", "oracle")
     objects = KitchenEnv.layout.names[1:]
     assert [(r["estimator"], r["entity"]) for r in rows] == [
         (name, entity) for name in names for entity in ("all", *objects)
@@ -170,7 +171,7 @@ def test_estimators_are_compared_on_unseen_demonstrations(
     assert by_name["oracle", "all"]["false_positive_rate"] == 0
     # The hand opens the microwave at its handle.
     assert by_name["distance_action", "microwave"]["auc"] > 0.9
-    assert len((tmp_path / "influence.csv").read_text().splitlines()) == 61
+    assert len((tmp_path / "influence.csv").read_text().splitlines()) == 81
 
 
 def test_all_tasks(tmp_path, steps, compose, monkeypatch):

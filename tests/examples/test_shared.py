@@ -96,6 +96,16 @@ def test_experiments_share_the_published_table(steps, tmp_path):
         *("kitchen", "θ", "rule"),
     ]
     assert lines[2].split()[1:5] == ["0.5", "1", "0.9", "0.1"]
+    other = [{**row, "estimator": "other"} for row in table]
+    publish_comparison(tmp_path, other, experiment="push")
+    publish_comparison(tmp_path, other, experiment="push")
+    with (tmp_path / "influence.csv").open() as file:
+        found = [(r["experiment"], r["estimator"]) for r in csv.DictReader(file)]
+    assert found == [
+        *[("push", "rule")] * 3,
+        *[("push", "other")] * 3,
+        *[("kitchen", "rule")] * 3,
+    ]
     (tmp_path / "influence.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match=r"columns \['a', 'b'\]"):
         publish_comparison(tmp_path, table, experiment="push")

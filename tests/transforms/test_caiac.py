@@ -45,13 +45,21 @@ from torchrl_caiac import EntityLayout
 from torchrl_caiac.transforms import CAIACTransform, TransformKeys
 
 
+def limit(case: Case, entity: int) -> float:
+    """The largest score of an uninfluenced entity."""
+    threshold = case.transform.threshold
+    if isinstance(threshold, float):
+        return threshold
+    return threshold.get(case.layout.names[entity], -math.inf)
+
+
 def donor_windows(case: Case, entity: int) -> set[tuple[int, ...]]:
     """The row names of all windows that may donate an entity, one by one."""
-    data, found = stored(case.donors), set()
+    data, found, theta = stored(case.donors), set(), limit(case, entity)
     for part in time_windows(case.donors, case.window):
         names = tuple(data["row"][part].tolist())
         # `<=` in float32, as the scores are stored
-        free = all(bool(data["caiac", "score"][i, entity] <= THRESHOLD) for i in part)
+        free = all(bool(data["caiac", "score"][i, entity] <= theta) for i in part)
         may = case.layout.names[entity] not in case.layout.fixed
         if may and free and not case.stale & set(names):
             found.add(names)
@@ -79,7 +87,9 @@ def check_batch(case: Case, batch: TensorDict, missing: list[int]) -> None:
         [
             layout.names[n] not in layout.fixed
             and not case.stale & set(names[b])
-            and all(bool(score[b * window + k, n] <= THRESHOLD) for k in range(window))
+            and all(
+                bool(score[b * window + k, n] <= limit(case, n)) for k in range(window)
+            )
             for n in range(N)
         ]
         for b in range(total)
@@ -164,9 +174,11 @@ def cases(draw: st.DrawFn) -> Case:
     chosen = draw(st.sampled_from(["random", "last"]))
     # A storage may be given as well.
     source = donors.storage if donors is not None and draw(st.booleans()) else donors
+    names = [name for name in layout.names if name not in layout.fixed]
+    each = {name: draw(st.sampled_from([-1.0, THRESHOLD, 0.4, 9.0])) for name in names}
     transform = CAIACTransform(
         layout,
-        threshold=THRESHOLD,
+        threshold=draw(st.sampled_from([THRESHOLD, each])),
         counterfactual_ratio=ratio,
         rows=chosen,
         swap_prob=swap_prob,
@@ -405,6 +417,7 @@ def test_works_under_prefetch_and_in_a_tensordict_buffer() -> None:
         ("threshold", math.nan, ValueError),
         ("threshold", math.inf, ValueError),
         ("threshold", "0.1", TypeError),
+        ("threshold", None, TypeError),
         ("counterfactual_ratio", 1.5, ValueError),
         ("counterfactual_ratio", -0.5, ValueError),
         ("counterfactual_ratio", True, TypeError),

@@ -27,7 +27,7 @@ __all__ = ["ArraySet", "FlatArrays", "LostRows", "episode_parts", "next_states"]
 _logger = logging.getLogger("torchrl_caiac.data.from_arrays")
 
 # Arrays are read in parts of this size, in bytes.
-_CHUNK = 32 << 20
+_CHUNK = 16 << 20
 
 
 @dataclasses.dataclass(frozen=True)

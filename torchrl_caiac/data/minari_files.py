@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchrl_caiac._files import UnreadableFileError, whole_folder
+from torchrl_caiac.data.collect import collection_folder
 from torchrl_caiac.data.minari_checks import check_metadata
 
 if TYPE_CHECKING:
+    from gymnasium import Space
     from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
 
@@ -169,24 +171,23 @@ def work_folder(work: str | os.PathLike[str] | None, dataset_id: str) -> Iterato
         ...     folder.as_posix()
         '/work/push-play-v0'
     """
-    if work is not None:
-        yield Path(work) / dataset_id.replace("/", "-")
-        return
-    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
-        yield Path(folder)
+    own = None if work is None else Path(work) / dataset_id.replace("/", "-")
+    with collection_folder(own) as folder:
+        yield folder
 
 
 def publish_dataset(
     dataset_id: str,
     buffers: Iterable[EpisodeBuffer],
     target: Path,
-    make_env: Callable[[], Any],
+    make_env: Callable[[], Any] | None,
     *,
     code: str,
     requirements: Sequence[str],
     progress: bool,
     description: str,
     algorithm_name: str,
+    spaces: tuple[Space[Any], Space[Any]] | None = None,
 ) -> MinariDataset:
     """Writes a Minari dataset, atomically.
 
@@ -195,7 +196,8 @@ def publish_dataset(
         buffers (iterable of EpisodeBuffer): the episodes.
         target (Path): the folder, as returned by :func:`free_dataset_path`. It is
             replaced if it exists.
-        make_env (callable): creates the environment, whose specification Minari stores.
+        make_env (callable, optional): creates the environment, whose specification
+            Minari stores. ``None``: it is unknown, and ``spaces`` are given.
 
     Keyword Args:
         code (str): the file that collected the dataset.
@@ -204,6 +206,9 @@ def publish_dataset(
         progress (bool): whether to show a progress bar.
         description (str): the content of the dataset.
         algorithm_name (str): the policy that acted.
+        spaces (tuple of gymnasium.Space, optional): the spaces of the observations and
+            of the actions. Images are then stored without loss. Defaults to ``None``:
+            those of the environment.
 
     Returns:
         MinariDataset: the dataset.
@@ -240,13 +245,20 @@ def publish_dataset(
     from minari import MinariDataset
     from tqdm import tqdm
 
-    env = make_env()
+    env = None if make_env is None else make_env()
+    options: dict[str, Any] = {}
+    if spaces is not None:
+        # Minari would compress images as JPEG.
+        options = {"jpeg_encoding": False}
+        options["observation_space"], options["action_space"] = spaces
     try:
         with whole_folder(target) as made:
             partial = made.parent / "minari"
             partial.mkdir()
             bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
-            with _datasets_in(partial):
+            with _datasets_in(partial), warnings.catch_warnings():
+                if env is None:  # which is what it warns of
+                    warnings.filterwarnings("ignore", module="minari")
                 minari.create_dataset_from_buffers(
                     dataset_id,
                     bar,
@@ -258,6 +270,7 @@ def publish_dataset(
                     code_permalink=code,
                     description=description,
                     requirements=list(requirements),
+                    **options,
                 )
             built = partial / dataset_id
             # Minari stores the description of a namespace in a separate file.
@@ -266,5 +279,6 @@ def publish_dataset(
                     os.replace(extra, target.parent / extra.name)
             os.replace(built, made)
     finally:
-        env.close()
+        if env is not None:
+            env.close()
     return MinariDataset(target / "data")

@@ -6,9 +6,7 @@ import functools
 import hashlib
 import os
 import pickle
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -17,7 +15,12 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac._keys import as_key
-from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
+from torchrl_caiac.data.collect import (
+    collect_episodes,
+    collection_folder,
+    load_episode,
+    record_episode,
+)
 from torchrl_caiac.data.trees import copy_tree
 from torchrl_caiac.data.write_transitions import check_free, write_transitions
 
@@ -103,9 +106,9 @@ def random_transitions(
     Args:
         env (callable): makes the environment, in each process: a class or a
             ``functools.partial`` of one, such as
-            :class:`~torchrl_caiac.envs.ogbench.OGBenchSimulator`,
-            :class:`~torchrl_caiac.envs.kitchen.RestorableKitchen` or
-            :class:`~torchrl_caiac.envs.fetch_push.RestorableFetchPush`. For others a
+            :class:`~torchrl_caiac.envs.OGBenchSimulator`,
+            :class:`~torchrl_caiac.envs.RestorableKitchen` or
+            :class:`~torchrl_caiac.envs.RestorableFetchPush`. For others a
             class of a few lines is enough, see :class:`RestorableEnv`.
         states (array_like): the states ``[M, S]``.
         actions_per_state (int): the number of times that each state is restored, for
@@ -146,8 +149,7 @@ def random_transitions(
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_caiac.envs import random_transitions
-        >>> from torchrl_caiac.envs.ogbench import OGBenchSimulator
+        >>> from torchrl_caiac.envs import OGBenchSimulator, random_transitions
         >>> simulator = OGBenchSimulator("cube-double")
         >>> states = np.stack([simulator.reset(seed=i) for i in range(3)])
         >>> rows = random_transitions(
@@ -179,7 +181,7 @@ def random_transitions(
         {**spec, "first": first, "last": min(first + states_per_file, total)}
         for first in range(0, total, states_per_file)
     ]
-    with _work_folder(work) as folder:
+    with collection_folder(work) as folder:
         for name, array in arrays.items():
             keep_array(folder / name, array)
         report = collect_episodes(
@@ -192,9 +194,7 @@ def random_transitions(
             description=f"random actions, {states_per_file} states at a time",
         )
         parts = [load_episode(file)[0] for file in report.files]
-    rows: TensorDict = torch.cat(  # type: ignore[assignment]
-        [_transitions(part[_ROOT], key) for part in parts]  # type: ignore[arg-type]
-    )
+    rows: TensorDict = torch.cat([_transitions(part[_ROOT], key) for part in parts])
     lengths = torch.from_numpy(np.concatenate([part["lengths"] for part in parts]))
     rows["episode"] = torch.arange(len(lengths)).repeat_interleave(lengths)
     if path is None:
@@ -228,7 +228,7 @@ def random_episodes(
         :func:`~torchrl_caiac.data.collect.record_episode` returns it.
 
     Raises:
-        ValueError: the bounds of the actions are not finite.
+        ValueError: the action space is not a box, or its bounds are not finite.
 
     Examples:
         >>> import numpy as np
@@ -242,6 +242,10 @@ def random_episodes(
         (3, 4)
     """
     space = env.action_space
+    if not (hasattr(space, "low") and hasattr(space, "high")):
+        raise ValueError(
+            f"the action space is {space}, expected a box: uniform actions need bounds"
+        )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise ValueError(
             f"the bounds of the actions are {space.low} and {space.high}, expected "
@@ -327,15 +331,6 @@ def _digest(env: Callable[[], RestorableEnv]) -> str:
             "its parts from those of another environment: give a class or a "
             "functools.partial of one, or leave out work="
         ) from error
-
-
-@contextmanager
-def _work_folder(work: str | os.PathLike[str] | None) -> Iterator[Path]:
-    if work is not None:
-        yield Path(work)
-        return
-    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
-        yield Path(folder)
 
 
 class _Source:

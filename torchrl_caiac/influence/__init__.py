@@ -5,6 +5,10 @@ from __future__ import annotations
 from torchrl_caiac.influence.action_coverage import ActionCoverage, action_coverage
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI
+from torchrl_caiac.influence.default_world_model import (
+    DEFAULT_FIT,
+    default_world_model,
+)
 from torchrl_caiac.influence.distance import DistanceInfluence
 from torchrl_caiac.influence.metrics import (
     EntityReport,
@@ -18,6 +22,10 @@ from torchrl_caiac.influence.residual import ResidualInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
+from torchrl_caiac.influence.thresholds import (
+    ThresholdSuggestions,
+    suggest_thresholds,
+)
 from torchrl_caiac.influence.truth import (
     SimulatorInfluence,
     TrueInfluence,
@@ -27,6 +35,7 @@ from torchrl_caiac.influence.truth import (
 
 __all__ = [
     "CAI",
+    "DEFAULT_FIT",
     "ActionCoverage",
     "AttentionInfluence",
     "DistanceInfluence",
@@ -35,14 +44,17 @@ __all__ = [
     "ResidualInfluence",
     "ScoreOnWrite",
     "SimulatorInfluence",
+    "ThresholdSuggestions",
     "TrueInfluence",
     "action_coverage",
     "best_threshold",
     "causal_action_influence",
+    "default_world_model",
     "influence_report",
     "oracle_score",
     "roc_auc",
     "score_buffer",
     "score_file",
+    "suggest_thresholds",
     "true_influence",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
@@ -118,7 +118,7 @@ def influence_report(
     scores: ArrayLike | torch.Tensor,
     truth: ArrayLike | torch.Tensor,
     names: Sequence[str],
-    threshold: float,
+    threshold: float | Mapping[str, float],
 ) -> dict[str, EntityReport]:
     """Compares scores with the ground truth, entity by entity.
 
@@ -127,7 +127,9 @@ def influence_report(
         truth (array_like or torch.Tensor): the ground truth of
             :func:`~torchrl_caiac.influence.true_influence`, bool ``[S, N]``.
         names (sequence of str): the ``N`` entities.
-        threshold (float): θ. A score above it counts as influence.
+        threshold (float or mapping of str to float): θ. A score above it counts as
+            influence. One number for all entities, or one for each; entities without
+            one are left out of the report.
 
     Returns:
         dict of str to EntityReport: the report for each entity.
@@ -155,8 +157,14 @@ def influence_report(
         )
     report: dict[str, EntityReport] = {}
     for i, name in enumerate(names):
+        if isinstance(threshold, Mapping):
+            if name not in threshold:
+                continue
+            theta = threshold[name]
+        else:
+            theta = threshold
         score, own = _checked(values[:, i], mask[:, i])
-        above = score > threshold
+        above = score > theta
         best, accuracy = best_threshold(score, own)
         report[name] = EntityReport(
             auc=roc_auc(score, own),

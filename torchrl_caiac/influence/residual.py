@@ -157,7 +157,7 @@ class ResidualInfluence(MotionInfluence):
         self,
         data: TensorDictBase | ReplayBuffer,
         *,
-        steps: int = 3_000,
+        steps: int = 2_000,
         batch_size: int = 1_024,
         lr: float = 3e-3,
         max_rows: int = 200_000,
@@ -173,7 +173,7 @@ class ResidualInfluence(MotionInfluence):
             data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
 
         Keyword Args:
-            steps (int): the number of gradient steps. Defaults to 3,000.
+            steps (int): the number of gradient steps. Defaults to 2,000.
             batch_size (int): the number of rows in a step. Defaults to 1,024.
             lr (float): the learning rate of Adam, which decays to 0 along a cosine.
                 Defaults to 3e-3.

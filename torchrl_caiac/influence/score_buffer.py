@@ -18,12 +18,13 @@ from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import (
     add_revision,
     drop_prefetched,
-    known_to_be_memmap,
+    forget_leaves,
     memmap_folder,
     storage_data,
     storage_rows,
 )
 from torchrl_caiac.check import check_before_use
+from torchrl_caiac.data.add_leaf import store_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.estimator_digest import estimator_digest
 from torchrl_caiac.influence.score_leaf import (
@@ -41,6 +42,7 @@ from torchrl_caiac.influence.score_record import (
     settings_that_differ,
     write_record,
 )
+from torchrl_caiac.influence.score_spread import warn_of_one_side
 from torchrl_caiac.influence.scorer import Scorer, check_int, layout_of
 from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
@@ -129,6 +131,11 @@ def score_buffer(
     One process at a time may score a folder. Open data in a folder with
     :func:`torchrl_caiac.data.load_transitions`, which detects truncated files.
 
+    A warning names entities of which all scores lie on one side of the default
+    threshold of :class:`~torchrl_caiac.CAIACTransform`, so that they would be swapped
+    in no row, or in all of them; see
+    :func:`~torchrl_caiac.influence.suggest_thresholds`.
+
     Args:
         rb (ReplayBuffer): a buffer with a storage of tensordicts, ``[T]`` or
             ``[T, *B]``, full or not. See
@@ -210,7 +217,8 @@ def score_buffer(
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     key, storage = as_key(key), rb.storage
-    known_to_be_memmap(storage_data(storage))
+    if store_leaves(storage_data(storage)):
+        forget_leaves(storage)
     layout = layout_of(estimator)
     settings = score_settings(
         estimator_digest(estimator),
@@ -277,6 +285,9 @@ def score_buffer(
         )
     # Prefetched batches lack the leaf, or have it unscored.
     drop_prefetched(rb)
+    leaves = find_leaves(storage, key)
+    if number and leaves is not None and leaves.scores.ndim == 2:
+        warn_of_one_side(leaves.scores[: len(storage)], layout)
 
 
 def _one_pass(

@@ -9,11 +9,13 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.threshold_rule import DEFAULT_THRESHOLD
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 from torchrl_caiac.transforms.draws import draw_batch_donors, uninfluenced
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import RewardFn, TerminatedFn
+from torchrl_caiac.transforms.thresholds import ThresholdArgument
 
 __all__ = ["CAIACTransform"]
 
@@ -56,8 +58,14 @@ class CAIACTransform(CounterfactualTransform):
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
-        threshold (float): the largest score of an uninfluenced entity, θ of section
-            3.3, in nats for CAI. Defaults to 0.05.
+        threshold (float, mapping of str to float or str): the largest score of an
+            uninfluenced entity, θ of section 3.3, in nats for CAI. One number, or one
+            for each entity that is not fixed, where a number below 0 means that the
+            entity is never swapped. ``"auto"``: chosen at the first sample by
+            :func:`~torchrl_caiac.influence.suggest_thresholds` from the scores of the
+            buffer that samples, logged, and kept in :attr:`thresholds`; entities
+            without a clear threshold are never swapped, and a warning names them.
+            Defaults to 0.05.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual, in [0, 1]. Defaults to 0.5.
 
@@ -129,7 +137,7 @@ class CAIACTransform(CounterfactualTransform):
     def __init__(
         self,
         layout: EntityLayout,
-        threshold: float = 0.05,
+        threshold: ThresholdArgument = DEFAULT_THRESHOLD,
         counterfactual_ratio: float = 0.5,
         *,
         rows: Literal["random", "last"] = "random",
@@ -174,7 +182,7 @@ class CAIACTransform(CounterfactualTransform):
         Returns:
             torch.Tensor: bool ``[B, N]``, never true for ``fixed`` entities.
         """
-        free = uninfluenced(scores, self.threshold, self.window)
+        free = uninfluenced(scores, self._thresholds.limit(scores), self.window)
         if self._any_fixed:
             if self._swappable.device != free.device:
                 self._swappable = self._swappable.to(free.device)

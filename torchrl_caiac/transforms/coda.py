@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import torch
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.transforms.checks import check_number
 from torchrl_caiac.transforms.components import (
     MAX_ENTITIES,
     ComponentDonors,
@@ -44,7 +47,8 @@ class CoDATransform(CounterfactualTransform):
 
     Args:
         layout (EntityLayout): at most 64 entities.
-        threshold (float): scores above it are links, θ. Defaults to 0.2.
+        threshold (float): scores above it are links, θ. One number, since a link
+            belongs to two entities. Defaults to 0.2.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual, in [0, 1]. Defaults to 0.5.
 
@@ -136,7 +140,7 @@ class CoDATransform(CounterfactualTransform):
     ) -> None:
         super().__init__(
             layout,
-            threshold,
+            _one_number(threshold),
             counterfactual_ratio,
             rows=rows,
             swap_prob=swap_prob,
@@ -180,4 +184,16 @@ class CoDATransform(CounterfactualTransform):
         """
         if self._fixed.device != scores.device:
             self._fixed = self._fixed.to(scores.device)
-        return components(scores, self.threshold, window=self.window, fixed=self._fixed)
+        theta = self._thresholds.number
+        return components(scores, theta, window=self.window, fixed=self._fixed)
+
+
+def _one_number(threshold: Any) -> float:
+    """Returns the threshold, or raises if it is for each entity or chosen."""
+    if isinstance(threshold, (Mapping, str)):
+        raise TypeError(
+            "CoDATransform has one graph of links between entities, and one threshold "
+            f"for all of them: pass a number, got {threshold!r}. CAIACTransform takes "
+            "one for each entity"
+        )
+    return check_number("threshold", threshold, math.inf)

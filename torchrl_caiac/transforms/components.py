@@ -370,7 +370,7 @@ class ComponentDonors(BufferDonors):
         """Finds the windows that may donate, see :func:`component_starts`."""
         return component_starts(
             scores,
-            self.threshold,
+            self.thresholds.number,
             self.layout.fixed_mask,
             window=self.window,
             trajectories=trajectories,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal, TypeVar
@@ -27,6 +26,7 @@ from torchrl_caiac.transforms.checks import (
 )
 from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
+from torchrl_caiac.transforms.free_share import FreeShare
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import (
@@ -36,6 +36,7 @@ from torchrl_caiac.transforms.rewards import (
     goal_vectors,
 )
 from torchrl_caiac.transforms.swap import SwapPlan, SwapPlanner, apply_swap
+from torchrl_caiac.transforms.thresholds import EntityThresholds, ThresholdArgument
 
 __all__ = ["CounterfactualTransform"]
 
@@ -52,7 +53,8 @@ class CounterfactualTransform(RandomTransform, ABC):
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
-        threshold (float): scores above it count as influence, θ.
+        threshold (float, mapping of str to float or str): scores above it count as
+            influence, θ: for all entities, for each, or ``"auto"``.
         counterfactual_ratio (float): share of rows (or windows) that become
             counterfactual.
 
@@ -81,7 +83,7 @@ class CounterfactualTransform(RandomTransform, ABC):
     def __init__(
         self,
         layout: EntityLayout,
-        threshold: float,
+        threshold: ThresholdArgument,
         counterfactual_ratio: float,
         *,
         rows: Literal["random", "last"],
@@ -99,7 +101,7 @@ class CounterfactualTransform(RandomTransform, ABC):
     ) -> None:
         super().__init__(check_generator(generator))
         self.layout = check_layout(layout)
-        self.threshold = check_number("threshold", threshold, math.inf)
+        self._thresholds = EntityThresholds(layout, threshold)
         self.counterfactual_ratio = check_number(
             "counterfactual_ratio", counterfactual_ratio, 1.0
         )
@@ -126,7 +128,7 @@ class CounterfactualTransform(RandomTransform, ABC):
                 self.donors_class(
                     donors,
                     layout,
-                    threshold=self.threshold,
+                    thresholds=self._thresholds,
                     window=window,
                     score_key=self.score_key,
                     keys=self.keys,
@@ -142,6 +144,7 @@ class CounterfactualTransform(RandomTransform, ABC):
             scores_name=self.donors_class.scores_name,
             unscored=self.unscored,
         )
+        self._free_share = FreeShare(layout)
         self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
         self._unscored = torch.zeros((), dtype=torch.int64)
         swapped = self._planner.keys
@@ -195,6 +198,20 @@ class CounterfactualTransform(RandomTransform, ABC):
     # --- settings and state ----------------------------------------------------------
 
     @property
+    def threshold(self) -> float | dict[str, float] | Literal["auto"]:
+        """The threshold as it was given."""
+        return self._thresholds.given
+
+    @property
+    def thresholds(self) -> dict[str, float]:
+        """The threshold of each entity that is not fixed.
+
+        Empty with ``threshold="auto"`` before the first sample. Below 0, an entity is
+        never swapped.
+        """
+        return self._thresholds.numbers
+
+    @property
     def reward_fn(self) -> RewardFn | None:
         """The function that recomputes rewards."""
         return self._goal_leaves.reward_fn
@@ -241,6 +258,21 @@ class CounterfactualTransform(RandomTransform, ABC):
         self._no_donor.share_memory_()
         self._unscored.share_memory_()
         return self
+
+    def get_extra_state(self) -> dict[str, torch.Tensor]:
+        """Returns the state of the generator, and thresholds chosen by ``"auto"``."""
+        state = super().get_extra_state()
+        if self.threshold == "auto" and self._thresholds.is_known:
+            numbers = list(self.thresholds.values())
+            state["thresholds"] = torch.tensor(numbers, dtype=torch.float64)
+        return state
+
+    def set_extra_state(self, state: dict[str, torch.Tensor]) -> None:
+        """Restores what :meth:`get_extra_state` returned."""
+        super().set_extra_state(state)
+        if self.threshold == "auto" and "thresholds" in state:
+            self._thresholds.restore(state["thresholds"])
+            self.refresh_donors()  # whose index depends on them
 
     # --- the two halves of an augmentation -------------------------------------------
 
@@ -370,11 +402,16 @@ class CounterfactualTransform(RandomTransform, ABC):
             self._check_shape(tensordict)
             tensordict = tensordict.reshape(-1)
         scores = self._scores(tensordict)
+        if not self._thresholds.is_known:
+            self._thresholds.choose_from(sampling_buffer(), self.score_key)
         plan, values = self._planner(tensordict)
         checked: CheckedScores | None = None
         if self.check:
             checked = self._batch_check.before(tensordict, scores)
             scores = checked.scores
+        if not self._free_share.is_done:
+            free = self.swappable(scores)
+            self._free_share.add(free, self._thresholds.expected)
         draw = self.generate_parameters(scores)
         if self.check and self._donors:
             draw = self._donors[0].verified(draw)
@@ -469,7 +506,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         """Returns the arguments, for ``repr``."""
         donors = f"{type(self.donors).__name__}" if self._donors else "the batch"
         return (
-            f"threshold={self.threshold}, "
+            f"threshold={self._thresholds}, "
             f"counterfactual_ratio={self.counterfactual_ratio}, "
             f"rows={self.chosen_rows!r}, swap_prob={self.swap_prob}, "
             f"window={self.window}, donors={donors}"

@@ -22,6 +22,7 @@ from torchrl_caiac.transforms.draws import DonorIndex, SwapDraw, draw_buffer_don
 from torchrl_caiac.transforms.indexing import plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.swap import SwapLeaf, SwapPlan, apply_swap
+from torchrl_caiac.transforms.thresholds import EntityThresholds
 
 if TYPE_CHECKING:
     from torchrl_caiac.transforms.goals.window import WindowGoal
@@ -77,7 +78,7 @@ def scan_donors(
 
 def eligible_starts(
     scores: torch.Tensor,
-    threshold: float,
+    threshold: float | torch.Tensor,
     swappable: torch.Tensor,
     *,
     window: int = 1,
@@ -91,7 +92,8 @@ def eligible_starts(
 
     Args:
         scores (torch.Tensor): ``[T, N]``, NaN where a row was not scored.
-        threshold (float): the largest score of an uninfluenced entity, θ.
+        threshold (float or torch.Tensor): the largest score of an uninfluenced entity,
+            θ; one number, or ``[N]``.
         swappable (torch.Tensor): bool ``[N]``; other entities get no rows.
 
     Keyword Args:
@@ -148,7 +150,7 @@ class BufferDonors:
         layout (EntityLayout): the entities.
 
     Keyword Args:
-        threshold (float): the largest score of an uninfluenced entity.
+        thresholds (EntityThresholds): the largest scores of uninfluenced entities.
         window (int): rows in a window.
         score_key (NestedKey): the scores, ``[T, N]``.
         keys (TransformKeys): trajectory ids and end flags.
@@ -166,7 +168,7 @@ class BufferDonors:
         donors: ReplayBuffer | TensorStorage,
         layout: EntityLayout,
         *,
-        threshold: float,
+        thresholds: EntityThresholds,
         window: int,
         score_key: NestedKey,
         keys: TransformKeys,
@@ -179,7 +181,7 @@ class BufferDonors:
             )
         self.donors = donors
         self.layout = layout
-        self.threshold = threshold
+        self.thresholds = thresholds
         self.window = window
         self.score_key = score_key
         self.keys = keys
@@ -208,7 +210,7 @@ class BufferDonors:
         """Finds the windows that may donate, see :func:`eligible_starts`."""
         return eligible_starts(
             scores,
-            self.threshold,
+            self.thresholds.limit(scores),
             ~self.layout.fixed_mask.to(scores.device),
             window=self.window,
             trajectories=trajectories,

@@ -63,14 +63,15 @@ class DonorIndex(NamedTuple):
 
 
 def uninfluenced(
-    scores: torch.Tensor, threshold: float, window: int = 1
+    scores: torch.Tensor, threshold: float | torch.Tensor, window: int = 1
 ) -> torch.Tensor:
     """Returns the entities that are uninfluenced in each window (section 3.3, eq. 1).
 
     Args:
         scores (torch.Tensor): ``[B * window, N]``; a row that was not scored (NaN) is
             not uninfluenced.
-        threshold (float): the largest score of an uninfluenced entity, θ.
+        threshold (float or torch.Tensor): the largest score of an uninfluenced entity,
+            θ; one number, or ``[N]`` with the dtype of the scores.
         window (int): rows in a window. Defaults to 1.
 
     Returns:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torchrl_caiac.envs.ogbench.datasets import create_ogbench_play
 from torchrl_caiac.envs.ogbench.registration import OGBENCH_ENVS, make_ogbench_env
 from torchrl_caiac.envs.ogbench.simulator import OGBenchSimulator, ogbench_states
+from torchrl_caiac.envs.ogbench.swaps import resimulate_swaps
 from torchrl_caiac.envs.ogbench.truth import OGBenchTruth
 
 __all__ = [
@@ -14,4 +15,5 @@ __all__ = [
     "create_ogbench_play",
     "make_ogbench_env",
     "ogbench_states",
+    "resimulate_swaps",
 ]

@@ -5,16 +5,18 @@ from __future__ import annotations
 import functools
 import logging
 import os
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from torchrl_caiac._files import whole_file
-from torchrl_caiac.data.collect import collect_episodes, load_episode
+from torchrl_caiac.data.collect import (
+    collect_episodes,
+    collection_folder,
+    load_episode,
+)
 from torchrl_caiac.envs.ogbench.registration import check_name, make_ogbench_env
 
 if TYPE_CHECKING:
@@ -43,6 +45,9 @@ _STACKING = {
 }
 # Metres by which a cube may leave the workspace before an episode is drawn again.
 _OUTSIDE = 0.2
+# In the scene, where a cube can be seen: between the walls, or in the drawer.
+_SCENE_SIDES = (-0.3, 0.29)
+_DRAWER_HEIGHTS = (0.06, 0.08)
 # The noise on positions, yaw and gripper of a noisy episode, relative to its level.
 _NOISE = np.array([1.0, 1.0, 1.0, 3.0, 10.0])
 
@@ -136,7 +141,7 @@ def create_ogbench_play(
         "noisy": noisy,
         **({"action_noise": action_noise} if noisy else {}),
     }
-    with _work_folder(work) as folder:
+    with collection_folder(work) as folder:
         report = collect_episodes(
             functools.partial(_Source, name, steps + 1, noisy),
             [spec] * episodes,
@@ -151,15 +156,6 @@ def create_ogbench_play(
             _write(partial, report.files)
     _logger.info("%s: %d episodes of %d steps of %s", target, episodes, steps, name)
     return target
-
-
-@contextmanager
-def _work_folder(work: str | os.PathLike[str] | None) -> Iterator[Path]:
-    if work is not None:
-        yield Path(work)
-        return
-    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
-        yield Path(folder)
 
 
 def _write(partial: Path, files: Sequence[Path]) -> None:
@@ -214,7 +210,7 @@ class _Source:
             rows["qvel"].append(info["prev_qvel"])
             if "prev_" + _BUTTONS in info:
                 rows[_BUTTONS].append(info["prev_" + _BUTTONS])
-            if self._outside(info):
+            if self._is_lost(info):
                 return None
             if oracle.done:
                 observation, info = simulation.set_new_target(p_stack=stacking)
@@ -230,14 +226,25 @@ class _Source:
         oracle.reset(observation, info)
         return oracle
 
-    def _outside(self, info: Mapping[str, Any]) -> bool:
-        """Returns whether a cube has been thrown out, as instabilities rarely do."""
+    def _is_lost(self, info: Mapping[str, Any]) -> bool:
+        """Returns whether a cube has been thrown out, or cannot be seen in the scene.
+
+        OGBench draws such an episode again too.
+        """
         low, high = self.env.unwrapped._workspace_bounds
-        cubes = [v for k, v in info.items() if k.endswith("_pos") and "/block_" in k]
-        return any(
-            bool((cube < low - _OUTSIDE).any() or (cube > high + _OUTSIDE).any())
-            for cube in cubes
-        )
+        for key, cube in info.items():
+            if not (key.startswith("privileged/block_") and key.endswith("_pos")):
+                continue
+            if (cube < low - _OUTSIDE).any() or (cube > high + _OUTSIDE).any():
+                return True
+            if self.name == "scene":
+                left, right = _SCENE_SIDES
+                bottom, top = _DRAWER_HEIGHTS
+                if cube[1] >= right or (
+                    cube[1] <= left and not bottom <= cube[2] <= top
+                ):
+                    return True
+        return False
 
     def close(self) -> None:
         self.env.close()

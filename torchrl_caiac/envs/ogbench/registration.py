@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    pass
+from torchrl_caiac.layouts import layout_names
 
 __all__ = ["OGBENCH_ENVS", "make_ogbench_env"]
 
+_PREFIX = "ogbench/"
 #: The names of the environments, without OGBench's version.
-OGBENCH_ENVS = (
-    "cube-single",
-    "cube-double",
-    "cube-triple",
-    "cube-quadruple",
-    "scene",
-    "puzzle-3x3",
-    "puzzle-4x4",
-    "puzzle-4x5",
-    "puzzle-4x6",
+OGBENCH_ENVS = tuple(
+    name.removeprefix(_PREFIX) for name in layout_names() if name.startswith(_PREFIX)
 )
 _VERSION = "-v0"
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.envs.ogbench.entities import ROBOT
-from torchrl_caiac.envs.ogbench.simulator import OGBenchSimulator
+from torchrl_caiac.envs.ogbench.simulator import ROBOT, OGBenchSimulator
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -48,12 +47,10 @@ class OGBenchTruth:
 
     def __init__(self, name: str = "cube-double") -> None:
         self._simulator = OGBenchSimulator(name)
-        columns, first = {ROBOT: range(3)}, 3
-        for entity, place in self._simulator.places.items():
-            width = 3 if place.stop - place.start == 7 else 1
-            width += entity.startswith("button")
-            columns[entity] = range(first, first + width)
-            first += width
+        columns, first = {}, 0
+        for entity, position in self._simulator.positions().items():
+            columns[entity] = range(first, first + len(position))
+            first += len(position)
         #: The positions of the hand and the entities.
         self.layout = EntityLayout(columns, fixed=(ROBOT,))
         #: The actions of OGBench.
@@ -63,9 +60,9 @@ class OGBenchTruth:
         """Returns which entities an action might move: a safe and fast bound.
 
         An entity is in reach if the gap between it and the robot, or another entity in
-        reach, is smaller than 8 cm and the way of the fastest entity in a step. In 800 states of
-        cube-double, scene and puzzle-3x3, no action bridged a gap wider than 5 cm. Actions
-        that are repeated for several steps were not measured.
+        reach, is smaller than 8 cm and the way of the fastest entity in a step. In 800
+        states of cube-double, scene and puzzle-3x3, no action bridged a gap wider than
+        5 cm. Actions that are repeated for several steps were not measured.
 
         Args:
             state (array_like): ``[S]``, see :class:`OGBenchSimulator`.
@@ -113,19 +110,10 @@ class OGBenchTruth:
         """
         return np.stack(
             [
-                self._values()
+                np.concatenate(list(self._simulator.positions().values()))
                 for _ in self._simulator.visit(state, actions, horizon=horizon)
             ]
         )
-
-    def _values(self) -> NDArray[np.float64]:
-        states = iter(self._simulator.button_states())
-        parts = []
-        for entity, position in self._simulator.positions().items():
-            parts.append(position)
-            if entity.startswith("button"):
-                parts.append(np.array([next(states)], dtype=np.float64))
-        return np.concatenate(parts)
 
     def close(self) -> None:
         """Closes OGBench's environment."""

@@ -1,0 +1,232 @@
+"""Originals and counterfactuals as one folder of transitions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tqdm.auto import tqdm
+
+from torchrl_caiac._files import reserve
+from torchrl_caiac._keys import path as path_of
+from torchrl_caiac.augment.rewards import find_sparse_reward
+from torchrl_caiac.augment.trajectories import (
+    TrajectoryPlan,
+    counterfactual_trajectories,
+)
+from torchrl_caiac.augment.transitions import counterfactual_transitions
+from torchrl_caiac.data import action_bounds, load_transitions
+from torchrl_caiac.data.action_bounds import write_action_bounds
+from torchrl_caiac.data.digests import write_digests
+from torchrl_caiac.data.write_transitions import check_free, whole_transitions
+from torchrl_caiac.scored import ScoredDataset
+from torchrl_caiac.trajectories import trajectory_index
+from torchrl_caiac.transforms import TransformKeys
+
+__all__ = ["augment_dataset"]
+
+_CHUNK = 1 << 14  # rows copied at a time
+_KEYS = TransformKeys()
+
+
+def augment_dataset(
+    scored: ScoredDataset,
+    path: str | os.PathLike[str],
+    ratio: float = 0.5,
+    *,
+    kind: Literal["transitions", "trajectories"] = "transitions",
+    reward: Literal["stored", "sparse"] | None = None,
+    tolerance: float | None = None,
+    originals: bool = True,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> TensorDict:
+    """Writes originals and counterfactuals as one folder of transitions, and opens it.
+
+    ``"transitions"`` are samples of a replay buffer with a
+    :class:`~torchrl_caiac.transforms.CAIACTransform` and the thresholds of ``scored``;
+    each is an episode of one step, cut off after it. ``"trajectories"`` are whole
+    trajectories in which entities that are uninfluenced from beginning to end are those
+    of other trajectories, at least as long. In each, at least one entity is swapped.
+
+    Goals follow if the layout maps them. The result has ``("caiac",
+    "counterfactual")``, bool ``[T, 1]``, and ``("caiac", "swapped")``, bool ``[T, N]``.
+    Entries under ``"info"`` are left out, since they would not follow, and so are other
+    entries that are neither part of the state nor of a transition.
+
+    Args:
+        scored (ScoredDataset): the dataset.
+        path (path): the folder to write. It is written atomically.
+        ratio (float): the share of counterfactual transitions (or trajectories) in
+            originals and counterfactuals together, in (0, 1). Defaults to 0.5.
+
+    Keyword Args:
+        kind (str): ``"transitions"`` or ``"trajectories"``. Defaults to
+            ``"transitions"``.
+        reward (str, optional): the rewards of counterfactuals. ``"stored"``: those of
+            the original transition; ``"sparse"``: recomputed, see
+            :func:`~torchrl_caiac.augment.find_sparse_reward`. It must be given if the
+            layout has goals and the data have rewards. Defaults to ``None``:
+            ``"stored"``.
+        tolerance (float, optional): that of sparse rewards. Defaults to ``None``: found
+            in the data.
+        originals (bool): whether the originals are written too. Defaults to ``True``.
+        seed (int): the seed. The same seed gives the same bytes. Defaults to 0.
+        overwrite (bool): whether to replace ``path`` if it exists. Defaults to
+            ``False``.
+        progress (bool): whether to show a progress bar. Defaults to ``True``.
+
+    Returns:
+        TensorDict: the memory-mapped transitions.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        OSError: the disk is full.
+        ValueError: an argument is out of range; nothing can be swapped; the choice of
+            rewards is missing; no sparse reward agrees with the stored ones.
+
+    Examples:
+        See :doc:`/cli`.
+    """
+    if not 0 < ratio < 1:
+        raise ValueError(f"ratio must be between 0 and 1, got {ratio}")
+    if kind not in ("transitions", "trajectories"):
+        raise ValueError(f"kind must be 'transitions' or 'trajectories', got {kind!r}")
+    check_free(path, overwrite)
+    options = _rewards(scored, reward, tolerance)
+    generator = torch.Generator().manual_seed(seed)
+    data = _kept(scored)
+    index = trajectory_index(scored.data)
+    parts: Iterator[TensorDictBase]
+    if kind == "trajectories":
+        count = _count(ratio, len(index.ends))
+        plan = TrajectoryPlan(scored, count, generator)
+        rows, number = plan.rows, count
+        parts = counterfactual_trajectories(plan, data, **options)
+    else:
+        rows = number = _count(ratio, len(data))
+        parts = _single_steps(
+            counterfactual_transitions(scored, data, rows, generator, **options)
+        )
+    before = len(data) if originals else 0
+    bounds = action_bounds(scored.data)
+    with whole_transitions(path) as folder:
+        first = _flagged(data[:1].to_tensordict(), scored)
+        first = first.exclude(*_scores(scored))
+        stored = first.expand(before + rows).memmap_like(folder)
+        reserve(folder)
+        for begin in range(0, before, _CHUNK):
+            part = data[begin : min(begin + _CHUNK, before)].to_tensordict()
+            part = _flagged(part, scored).select(*first.keys(True, True))
+            stored[begin : begin + len(part)].update_(part)
+        place, episode = before, len(index.ends) if originals else 0
+        bar = tqdm(total=number, disable=not progress, desc=kind, unit="")
+        with bar:
+            for part in parts:
+                part = part.select(*first.keys(True, True))
+                ids = torch.arange(len(part)) if kind == "transitions" else 0
+                part["episode"] = torch.zeros_like(part["episode"]) + episode + ids
+                stored[place : place + len(part)].update_(part)
+                place += len(part)
+                added = len(part) if kind == "transitions" else 1
+                episode += added
+                bar.update(added)
+        source = {
+            "scored": str(scored.path),
+            "kind": kind,
+            "ratio": ratio,
+            "originals": originals,
+            "seed": seed,
+            "reward": repr(options["reward_fn"]) if options else "stored",
+            "thresholds": scored.thresholds,
+        }
+        write_digests(folder, source=source)
+        if bounds is not None:
+            write_action_bounds(folder, *bounds)
+    return load_transitions(path)
+
+
+def _count(ratio: float, originals: int) -> int:
+    """Returns the number of counterfactuals, at least one."""
+    return max(1, round(ratio / (1 - ratio) * originals))
+
+
+def _scores(scored: ScoredDataset) -> list[Any]:
+    """Returns the keys that only the transform reads."""
+    kept = {path_of(_KEYS.counterfactual), path_of(_KEYS.swapped)}
+    return [
+        key
+        for key in scored.data.keys(True, True)
+        if path_of(key)[0] == path_of(scored.score_key)[0] and path_of(key) not in kept
+    ]
+
+
+def _kept(scored: ScoredDataset) -> TensorDictBase:
+    """Returns the transitions with the entries that follow a swap, and the scores."""
+    layout = scored.layout
+    states = [layout.in_keys, layout.desired_goal_key, layout.achieved_goal_key]
+    states += [*layout.goal.values(), *layout.achieved.values()]
+    roots = {"action", "episode", "observation"}
+    for key in _keys(states):
+        roots.add(path_of(key)[0])
+    known = {"reward", "done", "terminated", "truncated"}
+    kept = [
+        key
+        for key in scored.data.keys(True, True)
+        if path_of(key)[0] in roots
+        or path_of(key)[0] == path_of(scored.score_key)[0]
+        or (path_of(key)[0] == "next" and path_of(key)[1] in roots | known)
+    ]
+    return scored.data.select(*kept)
+
+
+def _keys(values: list[Any]) -> Iterator[Any]:
+    """Yields the keys among keys, lists of keys, columns and ``None``."""
+    for value in values:
+        if isinstance(value, list):
+            yield from value
+        elif value is not None and all(isinstance(part, str) for part in value):
+            yield value
+
+
+def _flagged(rows: TensorDictBase, scored: ScoredDataset) -> TensorDictBase:
+    shape = (len(rows), len(scored.layout))
+    rows[_KEYS.counterfactual] = torch.zeros(shape[0], 1, dtype=torch.bool)
+    rows[_KEYS.swapped] = torch.zeros(shape, dtype=torch.bool)
+    return rows
+
+
+def _single_steps(parts: Iterator[TensorDictBase]) -> Iterator[TensorDictBase]:
+    """Makes each row an episode of one step."""
+    for part in parts:
+        after = part["next"]
+        done = torch.ones_like(after["done"])
+        if after.get("terminated", None) is not None:
+            after["truncated"] = done & ~after["terminated"]
+        after["done"] = done
+        yield part
+
+
+def _rewards(
+    scored: ScoredDataset, reward: str | None, tolerance: float | None
+) -> dict[str, Any]:
+    if reward not in (None, "stored", "sparse"):
+        raise ValueError(f"reward must be 'stored' or 'sparse', got {reward!r}")
+    if tolerance is not None and reward != "sparse":
+        raise ValueError("a tolerance is given, but not the sparse reward that has it")
+    has_rewards = scored.data.get(_KEYS.reward, None) is not None
+    if reward is None and scored.layout.goal and has_rewards:
+        raise ValueError(
+            "the layout has goals and the data have rewards: say whether "
+            "counterfactuals keep the 'stored' rewards, or get 'sparse' ones of their "
+            "new goals"
+        )
+    if reward != "sparse":
+        return {}
+    if not scored.layout.goal:
+        raise ValueError("sparse rewards need goals, and the layout has none")
+    return {"reward_fn": find_sparse_reward(scored.data, scored.layout, tolerance)}

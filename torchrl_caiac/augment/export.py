@@ -1,0 +1,205 @@
+"""Transitions as one NumPy archive or HDF5 file, for other libraries."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+
+from torchrl_caiac._files import whole_file
+from torchrl_caiac._keys import path as path_of
+from torchrl_caiac.data.write_transitions import check_free
+
+__all__ = ["export_hdf5", "export_npz"]
+
+_CHUNK = 1 << 14  # rows copied at a time
+_NAMES = {
+    ("action",): "actions",
+    ("episode",): "episodes",
+    ("next", "reward"): "rewards",
+    ("next", "terminated"): "terminals",
+    ("next", "truncated"): "timeouts",
+    ("next", "done"): "dones",
+    ("caiac", "counterfactual"): "counterfactual",
+    ("caiac", "swapped"): "swapped",
+}
+
+
+def export_npz(
+    data: TensorDictBase,
+    path: str | os.PathLike[str],
+    *,
+    entities: Sequence[str] = (),
+    overwrite: bool = False,
+) -> Path:
+    """Writes transitions as a NumPy archive, with the names that D4RL uses.
+
+    The arrays are ``observations``, ``next_observations``, ``actions``, ``rewards``,
+    ``terminals``, ``timeouts``, ``dones`` and ``episodes``, and of augmented data
+    ``counterfactual`` and ``swapped``, all with one entry for each transition. Entries
+    of a nested observation, and goals, are ``observations/<name>``; then the
+    observation vector is ``observations/observation``. Read it with ``numpy.load``.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        path (path): the file. It is written atomically.
+
+    Keyword Args:
+        entities (sequence of str): the names of the columns of ``swapped``, written as
+            the array ``entities``. Defaults to ``()``: none.
+        overwrite (bool): whether to replace ``path`` if it exists. Defaults to
+            ``False``.
+
+    Returns:
+        Path: the file.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        OSError: the disk is full.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.augment import export_npz
+        >>> rows = TensorDict(
+        ...     {"observation": torch.zeros(3, 2), "action": torch.zeros(3, 1)}, [3]
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = export_npz(rows, f"{folder}/rows.npz")
+        ...     sorted(np.load(file))
+        ['actions', 'observations']
+    """
+    check_free(path, overwrite)
+    with (
+        whole_file(path) as partial,
+        zipfile.ZipFile(partial, "w", allowZip64=True) as archive,
+    ):
+        for name, leaf in _arrays(data):
+            kind = np.dtype(_numpy(leaf[:0]).dtype)
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                header = {
+                    "descr": np.lib.format.dtype_to_descr(kind),
+                    "fortran_order": False,
+                    "shape": tuple(leaf.shape),
+                }
+                np.lib.format.write_array_header_1_0(file, header)
+                for part in _parts(leaf):
+                    file.write(part.tobytes())
+        if entities:
+            with archive.open("entities.npy", "w") as file:
+                np.lib.format.write_array(file, np.array(entities), allow_pickle=False)
+    return Path(path)
+
+
+def export_hdf5(
+    data: TensorDictBase,
+    path: str | os.PathLike[str],
+    *,
+    entities: Sequence[str] = (),
+    overwrite: bool = False,
+) -> Path:
+    """Writes transitions as an HDF5 file, with the same names as :func:`export_npz`.
+
+    Read it with ``h5py.File``.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        path (path): the file. It is written atomically.
+
+    Keyword Args:
+        entities (sequence of str): the names of the columns of ``swapped``, written as
+            the attribute ``entities`` of the file. Defaults to ``()``: none.
+        overwrite (bool): whether to replace ``path`` if it exists. Defaults to
+            ``False``.
+
+    Returns:
+        Path: the file.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        ImportError: h5py is not installed.
+        OSError: the disk is full.
+
+    Examples:
+        >>> import tempfile
+        >>> import h5py
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.augment import export_hdf5
+        >>> rows = TensorDict(
+        ...     {"observation": {"arm": torch.ones(3, 2)}, "action": torch.ones(3)}, [3]
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with h5py.File(export_hdf5(rows, f"{folder}/rows.hdf5")) as file:
+        ...         file["observations/arm"].shape
+        (3, 2)
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError(
+            "HDF5 files need h5py: pip install 'torchrl-caiac[robomimic]'"
+        ) from error
+    check_free(path, overwrite)
+    with whole_file(path) as partial, h5py.File(partial, "w") as file:
+        for name, leaf in _arrays(data):
+            kind = _numpy(leaf[:0]).dtype
+            stored = file.create_dataset(name, shape=tuple(leaf.shape), dtype=kind)
+            begin = 0
+            for part in _parts(leaf):
+                stored[begin : begin + len(part)] = part
+                begin += len(part)
+        if entities:
+            file.attrs["entities"] = list(entities)
+    return Path(path)
+
+
+def _arrays(data: TensorDictBase) -> Iterator[tuple[str, torch.Tensor]]:
+    """Yields the names and tensors of the entries that have a name there."""
+    keys = sorted((path_of(key) for key in data.keys(True, True)), key=str)
+    states = [key for key in keys if _state(key) is not None]
+    is_vector = all(_state(key) == ("observation",) for key in states)
+    for key in keys:
+        state = _state(key)
+        if key in _NAMES:
+            leaf = data.get(key)
+            is_flag = key[0] == "next" and leaf.shape[1:] == (1,)
+            yield _NAMES[key], leaf.squeeze(-1) if is_flag or _is_mark(key) else leaf
+        elif state is not None:
+            name = "next_observations" if key[0] == "next" else "observations"
+            inner = state[1:] if state[0] == "observation" and state[1:] else state
+            yield "/".join((name, *(() if is_vector else inner))), data.get(key)
+
+
+def _is_mark(key: tuple[str, ...]) -> bool:
+    return key == ("caiac", "counterfactual")
+
+
+def _state(key: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Returns the key of an entry of the state; ``None`` for others."""
+    if key in _NAMES or key[0] in ("caiac", "info", "hindsight"):
+        return None
+    if key[0] == "next":
+        return None if key[1] in ("info", "caiac", "action") else key[1:]
+    return key
+
+
+def _parts(leaf: torch.Tensor) -> Iterator[NDArray[Any]]:
+    for begin in range(0, len(leaf), _CHUNK):
+        yield _numpy(leaf[begin : begin + _CHUNK])
+
+
+def _numpy(part: torch.Tensor) -> NDArray[Any]:
+    part = part.as_subclass(torch.Tensor).detach().cpu()
+    if part.dtype == torch.bfloat16:  # which NumPy does not have
+        part = part.float()
+    array = part.contiguous().numpy()
+    return np.ascontiguousarray(array)

@@ -1,0 +1,271 @@
+"""``caiac score``: the influence of the action on each entity, in each row."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from torchrl_caiac._files import claim_folder, read_json, write_json
+from torchrl_caiac.check import check_dataset
+from torchrl_caiac.cli.console import Console
+from torchrl_caiac.cli.errors import OK, UsageError
+from torchrl_caiac.cli.estimators import (
+    ESTIMATORS,
+    Context,
+    add_options,
+    estimator_settings,
+)
+from torchrl_caiac.cli.sources import (
+    SETTINGS_FILE,
+    add_data,
+    add_layout,
+    convert,
+    describe_source,
+    loader_options,
+    open_named,
+    read_layout,
+    remove_scores,
+)
+from torchrl_caiac.data import action_bounds, offline_buffer
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence import (
+    action_coverage,
+    score_buffer,
+    suggest_thresholds,
+)
+from torchrl_caiac.scored import ScoredDataset, write_scored
+
+__all__ = ["add_parser", "run"]
+
+_EPILOG = """\
+example:
+  caiac score episodes.npz --layout ogbench/cube-double --out scored
+An interrupted call resumes where it stopped when it is repeated.
+"""
+
+
+def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
+    """Adds the parser of the command."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "score",
+        help="score a dataset, and suggest thresholds",
+        description="Writes a folder with the transitions, for each of them the "
+        "influence of the action on every entity, the layout and suggested thresholds. "
+        "The dataset itself is not changed.",
+        epilog=_EPILOG,
+        **options,
+    )
+    add_data(parser)
+    add_layout(parser)
+    parser.add_argument(
+        "--out", required=True, metavar="DIR", help="the folder to write"
+    )
+    add_options(parser)
+    group = parser.add_argument_group("scores")
+    group.add_argument(
+        "--lookahead",
+        type=int,
+        default=1,
+        metavar="N",
+        help="an entity counts as influenced if it is so in one of the next N states "
+        "(default: %(default)s)",
+    )
+    group.add_argument(
+        "--smoothing",
+        type=int,
+        default=1,
+        metavar="N",
+        help="the width of a moving average along the episode (default: %(default)s)",
+    )
+    group.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace what an earlier call with other data or settings left in DIR",
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    """Runs the command."""
+    layout = read_layout(args.layout)
+    for name, least in (("lookahead", 0), ("smoothing", 1)):
+        if getattr(args, name) < least:
+            raise UsageError(f"--{name} must be at least {least}")
+    own = estimator_settings(args, layout)
+    described = describe_source(args.data, args.format, loader_options(args.option))
+    more = [describe_source(source) for source in args.more_data]
+    settings = {
+        **own,
+        **({"more_data": more} if more else {}),
+        "lookahead": args.lookahead,
+        "smoothing": args.smoothing,
+    }
+    folder = Path(args.out)
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"--out {folder} is a file: give a folder")
+    with claim_folder(folder):
+        data = convert(args.data, folder, described, console, overwrite=args.overwrite)
+        replace = _settle(args, layout, settings, folder)
+        context = Context(
+            layout,
+            data,
+            [open_named(source, args.cache, console) for source in args.more_data],
+            folder,
+            settings,
+            console,
+        )
+        scored = _score(args, context, described, replace=replace)
+    _show(scored, console)
+    return OK
+
+
+def _settle(
+    args: argparse.Namespace,
+    layout: EntityLayout,
+    settings: dict[str, Any],
+    folder: Path,
+) -> bool:
+    """Keeps the settings of a folder, and returns whether they replace others.
+
+    Raises:
+        UsageError: the folder is of a call with other settings.
+    """
+    file = folder / SETTINGS_FILE
+    kept: dict[str, Any] = {
+        "estimator": args.estimator,
+        "layout": layout.to_dict(),
+        "settings": settings,
+        "replaces": False,
+    }
+    if file.exists():
+        remedy = f"delete {folder}"
+        before = read_json(file, "file of settings", remedy)
+        before = before if isinstance(before, dict) else {}
+        kept["replaces"] = bool(before.get("replaces"))
+        if {**before, "replaces": kept["replaces"]} != kept:
+            if not args.overwrite:
+                raise UsageError(
+                    f"{folder} was scored with other settings "
+                    f"({_differences(before, kept)}): give another folder, or pass "
+                    "--overwrite to replace the scores"
+                )
+            remove_scores(folder)
+            kept["replaces"] = True
+    write_json(file, kept)
+    return bool(kept["replaces"])
+
+
+def _differences(before: dict[str, Any], now: dict[str, Any]) -> str:
+    found = []
+    if before.get("estimator") != now["estimator"]:
+        found.append(f"estimator was {before.get('estimator')}, is {now['estimator']}")
+    if before.get("layout") != now["layout"]:
+        found.append("the layout was another")
+    old = before.get("settings")
+    old = old if isinstance(old, dict) else {}
+    new = now["settings"]
+    if not found:
+        found += [
+            f"{name.replace('_', '-')} was {old.get(name)}, is {new.get(name)}"
+            for name in {**old, **new}
+            if old.get(name) != new.get(name)
+        ]
+    return "; ".join(found)
+
+
+def _score(
+    args: argparse.Namespace,
+    context: Context,
+    described: dict[str, Any],
+    *,
+    replace: bool,
+) -> ScoredDataset:
+    layout, data, console = context.layout, context.data, context.console
+    with console.step("checking"):
+        report = check_dataset(
+            data,
+            layout,
+            action_spec=action_bounds(data),
+            variance_floor=layout.variance_floor or None,
+        )
+    report.raise_if_errors()
+    for finding in report.warnings:
+        console.warn(f"{finding.message} ({finding.code}; to do: {finding.remedy})")
+    estimator = ESTIMATORS[args.estimator].make(context)
+    rb = offline_buffer(data)
+    with console.step("scoring"):
+        _write_scores(rb, estimator, context, replace=replace)
+    with console.step("suggesting thresholds"):
+        suggestions = suggest_thresholds(rb, layout)
+    coverage = _coverage(context)
+    return write_scored(
+        context.folder,
+        layout,
+        suggestions,
+        estimator=args.estimator,
+        settings=context.settings,
+        source=described,
+        warnings=console.warnings,
+        coverage=coverage,
+    )
+
+
+def _write_scores(rb: Any, estimator: Any, context: Context, *, replace: bool) -> None:
+    arguments: dict[str, Any] = {
+        "smoothing": context.settings["smoothing"],
+        "lookahead": context.settings["lookahead"],
+        "check": False,
+        "progress": context.console.progress,
+    }
+    try:
+        score_buffer(rb, estimator, **arguments)
+    except ValueError:
+        # Of other settings, which --overwrite has replaced; an interrupted call
+        # that has begun to replace them does not come here, and resumes.
+        if not replace:
+            raise
+        score_buffer(rb, estimator, overwrite=True, **arguments)
+
+
+def _coverage(context: Context) -> dict[str, Any] | None:
+    """Returns how far a world model's comparison of actions is backed by the data."""
+    if "num_actions" not in context.settings and "steps" not in context.settings:
+        return None
+    with context.console.step("looking at the actions"):
+        try:
+            found = action_coverage([context.data, *context.more], context.layout)
+        except ImportError as error:
+            context.console.warn(
+                f"whether the data hold different actions is not known: {error}"
+            )
+            return None
+    if found.verdict != "many":
+        context.console.warn(found.advice)
+    return found.to_dict()
+
+
+def _show(scored: ScoredDataset, console: Console) -> None:
+    console.text(f"{len(scored.data)} transitions, scored by {scored.estimator}\n")
+    console.text(f"{'entity':<18}{'threshold':>10}{'swappable':>11}   confidence")
+    for name, threshold in scored.thresholds.items():
+        console.text(
+            f"{name:<18}{threshold:>10.4g}{scored.free[name]:>11.1%}   "
+            f"{scored.confidence[name]}"
+        )
+    console.text(f"\nwritten to {scored.path}; next: caiac report {scored.path}")
+    console.document(
+        {
+            "written": str(scored.path),
+            "num_transitions": len(scored.data),
+            "estimator": scored.estimator,
+            "settings": scored.settings,
+            "thresholds": scored.thresholds,
+            "confidence": scored.confidence,
+            "reasons": scored.reasons,
+            "free": scored.free,
+            "coverage": scored.coverage,
+            "warnings": list(scored.warnings),
+        }
+    )
