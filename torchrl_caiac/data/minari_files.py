@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -255,7 +256,9 @@ def publish_dataset(
             partial = made.parent / "minari"
             partial.mkdir()
             bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
-            with _datasets_in(partial):
+            with _datasets_in(partial), warnings.catch_warnings():
+                if env is None:  # which is what it warns of
+                    warnings.filterwarnings("ignore", module="minari")
                 minari.create_dataset_from_buffers(
                     dataset_id,
                     bar,
