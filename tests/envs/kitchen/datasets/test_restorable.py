@@ -25,7 +25,7 @@ def test_recorded_actions_lead_to_the_recorded_states(random_actions, kitchen):
         for action, expected in zip(episode.actions, infos["qpos"][1:], strict=True):
             kitchen.step(action)
             # The controller starts from the observed joints, which have noise.
-            assert np.allclose(kitchen.record()["qpos"], expected, atol=5e-3)
+            assert np.allclose(kitchen.record()["qpos"], expected, atol=0.02)
 
 
 def test_random_rows_mix_with_kitchen_transitions(demonstrations):
