@@ -8,11 +8,15 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from tensordict import TensorDict, TensorDictBase
+
 from torchrl_caiac._files import remove_leftovers_in, whole_file
 from torchrl_caiac.augment import augment_dataset, export_hdf5, export_npz
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
 from torchrl_caiac.cli.report import open_folder
+from torchrl_caiac.data import action_bounds, to_minari
+from torchrl_caiac.data.minari_files import dataset_path
 from torchrl_caiac.scored import ScoredDataset, open_scored
 
 __all__ = ["add_parser", "run"]
@@ -94,9 +98,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.reward_tolerance is not None and args.reward != "sparse":
         raise UsageError("--reward-tolerance is an option of --reward sparse")
     kind = _kind(args.out)
-    if kind != "minari" and Path(args.out).exists() and not args.overwrite:
+    is_minari = kind == "minari"
+    target = dataset_path(_minari_id(args.out)) if is_minari else Path(args.out)
+    if target.exists() and not args.overwrite:
         raise UsageError(f"{args.out} exists: give another name, or pass --overwrite")
-    if kind != "minari" and _is_inside(Path(args.out), folder):
+    if _is_inside(target, folder):
         raise UsageError(f"--out {args.out} is inside of {folder}: write elsewhere")
     with console.step("reading the scored dataset"):
         scored = open_scored(folder)
@@ -139,6 +145,10 @@ def _kind(out: str) -> str:
     return "folder"
 
 
+def _minari_id(out: str) -> str:
+    return out.removeprefix("minari://")
+
+
 def _is_inside(out: Path, folder: Path) -> bool:
     return out.resolve().is_relative_to(folder.resolve())
 
@@ -150,14 +160,13 @@ def _write(
     if kind == "folder":
         return _summary(_augmented(args, scored, Path(args.out), console), scored, args)
     if kind == "minari":
-        from torchrl_caiac.data import to_minari
-
         with tempfile.TemporaryDirectory(prefix="caiac-") as work:
             data = _augmented(args, scored, Path(work) / "data", console)
             with console.step("writing the Minari dataset"):
                 to_minari(
-                    data,
-                    args.out.removeprefix("minari://"),
+                    _with_infos(data),
+                    _minari_id(args.out),
+                    action_bounds=action_bounds(data),
                     overwrite=args.overwrite,
                     progress=console.progress,
                 )
@@ -175,6 +184,13 @@ def _write(
             return _summary(data, scored, args)
         finally:
             shutil.rmtree(work, ignore_errors=True)
+
+
+def _with_infos(data: TensorDictBase) -> TensorDict:
+    """Returns the same transitions with their flags under ``"info"``, for Minari."""
+    entries = dict(data.items())
+    entries["info"] = entries.pop("caiac")
+    return TensorDict(entries, data.batch_size)
 
 
 def _augmented(

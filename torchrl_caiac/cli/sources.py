@@ -17,7 +17,13 @@ from tensordict import TensorDict
 from torchrl_caiac._files import claim_folder, plain, read_json, write_json
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import UsageError
-from torchrl_caiac.data import action_bounds, load_transitions, write_transitions
+from torchrl_caiac.data import (
+    FORMATS,
+    action_bounds,
+    load_transitions,
+    open_dataset,
+    write_transitions,
+)
 from torchrl_caiac.data.digests import data_digest, file_digest, has_digests
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.scored import DATA_FOLDER, LAYOUT_FILE, MODEL_FOLDER, SCORES_FILE
@@ -41,7 +47,6 @@ __all__ = [
 SOURCE_FILE, SETTINGS_FILE = "source.json", "settings.json"
 
 _META = "meta.json"
-_REMOTE = ("minari", "ogbench", "lerobot")
 _VIDEOS = {".mp4", ".png", ".jpg", ".jpeg", ".avi", ".webm", ".mkv"}
 _OF_SCORES = (SCORES_FILE, LAYOUT_FILE, MODEL_FOLDER)
 _DATA_HELP = (
@@ -66,7 +71,9 @@ def add_data(parser: argparse.ArgumentParser, *, cache: bool = True) -> None:
     parser.add_argument("data", metavar="DATA", help=_DATA_HELP)
     group = parser.add_argument_group("reading the data")
     group.add_argument(
-        "--format", metavar="NAME", help="the format, if it is not recognised"
+        "--format",
+        choices=[known.name for known in FORMATS],
+        help="the format (default: it is recognised)",
     )
     group.add_argument(
         "--option",
@@ -362,26 +369,23 @@ def _convert(
             rows.exclude("caiac"), data, action_bounds=action_bounds(rows)
         )
         return
+    is_there = path is not None or "://" in source or _minari_folder(source) is not None
     try:
-        from torchrl_caiac.data import open_dataset
-    except ImportError:  # SHIM
-        open_dataset = _shim
-
-    open_dataset(
-        source,
-        data,
-        format=described["format"],
-        progress=console.progress,
-        **described["options"],
-    )
-
-
-def _shim(source, path, *, format=None, progress=True, **options):  # SHIM
-    from torchrl_caiac.data import load_minari
-    from torchrl_caiac.data.load_ogbench import load_ogbench
-
-    if str(source).endswith(".npz"):
-        return load_ogbench(source, path, progress=progress, **options)
-    return load_minari(
-        source.removeprefix("minari://"), path, progress=progress, **options
-    )
+        open_dataset(
+            source,
+            data,
+            format=described["format"],
+            progress=console.progress,
+            **described["options"],
+        )
+    except TypeError as error:
+        if not described["options"]:
+            raise
+        raise UsageError(f"--option: {error}") from error
+    except (OSError, ValueError, KeyError, ImportError) as error:
+        text = str(error.args[0]) if isinstance(error, KeyError) else str(error)
+        if not is_there:
+            raise UsageError(text) from error
+        if Path(source).name in text:
+            raise
+        raise ValueError(f"{source}: {text}") from error
