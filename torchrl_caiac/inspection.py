@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._files import plain
 from torchrl_caiac._keys import as_key, floating, get_leaf, join, jsonable, missing_key
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac.data import action_bounds
@@ -153,7 +154,7 @@ class Inspection:
             shortest, median and longest length.
         """
         lengths = torch.tensor(self.lengths)
-        return {
+        found: dict[str, Any] = {
             "num_transitions": self.num_transitions,
             "num_looked_at": self.num_looked_at,
             "episodes": {
@@ -170,6 +171,8 @@ class Inspection:
             "notes": list(self.notes),
             "layouts": list(self.layouts),
         }
+        content: dict[str, Any] = plain(found)
+        return content
 
     def __str__(self) -> str:
         found = self.to_dict()["episodes"]

@@ -10,7 +10,13 @@ import h5py
 import numpy as np
 import pytest
 
-from torchrl_caiac.data import UnreadableFileError, action_bounds, from_arrays
+from torchrl_caiac.augment import export_hdf5, export_npz
+from torchrl_caiac.data import (
+    UnreadableFileError,
+    action_bounds,
+    from_arrays,
+    open_dataset,
+)
 from torchrl_caiac.data.load_array_file import load_array_file
 
 ENDS = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], bool)
@@ -84,13 +90,26 @@ def test_infos_are_kept_by_name(tmp_path, name, caplog):
     assert action_bounds(file.with_name("rows"))[1].tolist() == [1, 1]
 
 
-def test_groups_become_nested_observations(tmp_path):
+def test_groups_become_nested_observations(tmp_path, name):
     content = arrays()
     states, after = content.pop("observations"), content.pop("next_observations")
     for prefix, array in (("observations", states), ("next_observations", after)):
         content |= {f"{prefix}/arm": array[:, :1], f"{prefix}/cup": array[:, 1:]}
-    data = load(write(tmp_path / "a.hdf5", content))
+    data = load(write(tmp_path / name, content))
     assert np.array_equal(data["next", "observation", "cup"], after[:, 1:])
+
+
+@pytest.mark.parametrize("export", [export_npz, export_hdf5])
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_exported_transitions_are_read_back(tmp_path, export, is_nested):
+    first = expected(tmp_path / "b")
+    if is_nested:
+        first = first.clone()
+        for td in (first, first["next"]):
+            td["achieved_goal"] = td["observation"][:, :1]
+    file = export(first, tmp_path / f"a.{export.__name__.removeprefix('export_')}")
+    again = open_dataset(file, tmp_path / "rows", progress=False)
+    assert (again == first).all()
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study")
-SCRIPTS += ("compare_influence", "compare_precision", "sweep_variance_floor")
-SHARED = ("console", "log", "parts", "settings", "tables")
+SCRIPTS += ("compare_influence", "compare_precision")
+SCRIPTS += ("suggest_thresholds", "sweep_variance_floor")
+SHARED = ("console", "log", "parts", "settings", "tables", "thresholds")
 SMALL_ENV = {
     "kitchen": {
         "collect": {"episodes": 2, "held_out": 1},

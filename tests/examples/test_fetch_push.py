@@ -410,6 +410,24 @@ def test_estimators_are_compared_on_unseen_episodes(
     assert environment.held_out().get("score", None) is None
 
 
+def test_suggested_thresholds_are_compared_with_the_best(
+    cfg, environment, steps, compose, tmp_path
+):
+    compared = compose("env=fetch_push", out=cfg.out, config="suggest_thresholds")
+    compared.publish = str(tmp_path)
+    with steps.console.Console(tmp_path, stages=4) as console:
+        rows = steps.suggest_thresholds.compare(compared, console)
+    assert {(r["estimator"], r["entity"]) for r in rows} >= {
+        ("caiac", "cube0"),
+        ("caiac", "cube1"),
+    }
+    for row in rows:
+        if row["confidence"] == "two clear modes":
+            assert row["loss"] >= 0
+    assert len((tmp_path / "thresholds.csv").read_text().splitlines()) == 1 + len(rows)
+    assert environment.held_out().get("suggested", None) is None
+
+
 def test_a_run_that_another_process_has_begun(cfg, steps):
     with (
         claim_folder(steps.parts.run_folder(cfg, "none", 9)),

@@ -139,9 +139,17 @@ def test_large_data_are_sampled_and_the_same_twice() -> None:
     assert one.confidence == every.confidence
     above = data["caiac", "score"][:, 1] > one.thresholds["cup"]
     assert (above == data["pushed"]).double().mean() > 0.99
-    # the shares, and the limit of what never moves, are those of all rows
+    # the shares are those of all rows
     assert one.free["cup"] == pytest.approx((~above).double().mean().item())
-    assert one.thresholds["lid"] > data["caiac", "score"][:, 2].max()
+    assert one.free["lid"] > 0.9999
+
+
+def test_a_rare_high_score_of_what_never_moves_is_not_free() -> None:
+    data = world(60_000)
+    data["caiac", "score"][30_123, 2] = 1e6
+    found = suggest_thresholds(data, LAYOUT, max_rows=5000)
+    assert found.confidence["lid"] == "one mode: never influenced"
+    assert found.thresholds["lid"] < 100 and 0.9999 < found.free["lid"] < 1
 
 
 def test_rows_without_scores_are_left_out() -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 
 import pytest
@@ -122,3 +123,11 @@ def test_the_page_has_every_layout() -> None:
     text = DOCS.read_text()
     for name in layout_names():
         assert f"`{name}`" in text, name
+
+
+def test_the_files_of_the_page_can_be_loaded(tmp_path: Path) -> None:
+    files = re.findall(r"```yaml\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    assert len(files) == 2
+    for i, text in enumerate(files):
+        (tmp_path / f"{i}.yaml").write_text(text)
+        EntityLayout.load(tmp_path / f"{i}.yaml")

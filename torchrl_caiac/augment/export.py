@@ -198,5 +198,8 @@ def _parts(leaf: torch.Tensor) -> Iterator[NDArray[Any]]:
 
 
 def _numpy(part: torch.Tensor) -> NDArray[Any]:
-    array = part.as_subclass(torch.Tensor).detach().cpu().contiguous().numpy()
+    part = part.as_subclass(torch.Tensor).detach().cpu()
+    if part.dtype == torch.bfloat16:  # which NumPy does not have
+        part = part.float()
+    array = part.contiguous().numpy()
     return np.ascontiguousarray(array)

@@ -187,9 +187,10 @@ def _write(
 
 
 def _with_infos(data: TensorDictBase) -> TensorDict:
-    """Returns the same transitions, with the flags under ``"info"``, as Minari wants."""
-    entries = {key: data.get(key) for key in data.keys() if key != "caiac"}
-    return TensorDict({**entries, "info": data.get("caiac")}, data.batch_size)
+    """Returns the same transitions with their flags under ``"info"``, for Minari."""
+    entries = dict(data.items())
+    entries["info"] = entries.pop("caiac")
+    return TensorDict(entries, data.batch_size)
 
 
 def _augmented(

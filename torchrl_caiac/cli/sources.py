@@ -378,11 +378,14 @@ def _convert(
             progress=console.progress,
             **described["options"],
         )
-    except (FileNotFoundError, ValueError) as error:
-        if is_there:
-            raise
-        raise UsageError(str(error)) from error
     except TypeError as error:
         if not described["options"]:
             raise
         raise UsageError(f"--option: {error}") from error
+    except (OSError, ValueError, KeyError, ImportError) as error:
+        text = str(error.args[0]) if isinstance(error, KeyError) else str(error)
+        if not is_there:
+            raise UsageError(text) from error
+        if Path(source).name in text:
+            raise
+        raise ValueError(f"{source}: {text}") from error

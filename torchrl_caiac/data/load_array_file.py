@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,9 @@ _ARGUMENTS = {
         "desired_goals",
         "next_achieved_goals",
     )
-} | {"terminations": "terminals", "truncations": "timeouts"}
+}
+_ARGUMENTS |= {"terminations": "terminals", "truncations": "timeouts"}
+_ARGUMENTS |= {"episodes": "episode_ids"}
 
 
 def load_array_file(
@@ -55,9 +57,11 @@ def load_array_file(
     The names of the arrays are those of the arguments of
     :func:`~torchrl_caiac.data.from_arrays`, as in files of D4RL: ``observations`` and
     ``actions`` are needed, and so are ``terminals``, ``timeouts``, ``episode_ids`` or
-    ``episode_lengths``, which say where episodes end. ``terminations`` and
-    ``truncations`` are read as ``terminals`` and ``timeouts``. In HDF5 files,
-    ``observations`` may be a group, which becomes a nested observation.
+    ``episode_lengths``, which say where episodes end. ``terminations``,
+    ``truncations`` and ``episodes`` are read as ``terminals``, ``timeouts`` and
+    ``episode_ids``. A group ``observations``, or arrays ``observations/<name>`` in an
+    ``.npz`` file, become a nested observation. These are also the files that
+    :mod:`torchrl_caiac.augment` writes.
 
     Args:
         file (str or Path): the file, ``.npz`` or HDF5.
@@ -146,11 +150,7 @@ def _arrays(file: Path, stack: ExitStack) -> Mapping[str, Any]:
     """Returns the arrays of a file, or what reads them in parts."""
     if file.suffix == ".npz":
         streams = stack.enter_context(NpzStreams(file, "file of arrays", _AGAIN))
-        return {
-            name: streams.take(name, kind.shape[0])
-            for name, kind in streams.kinds.items()
-            if kind.shape
-        }
+        return _Archive(streams)
     try:
         import h5py
     except ImportError as error:
@@ -175,6 +175,42 @@ def _arrays(file: Path, stack: ExitStack) -> Mapping[str, Any]:
         else:
             found |= {f"{name}/{inner}": _tree(item[inner]) for inner in item}
     return found
+
+
+class _Archive(Mapping[str, Any]):
+    """The arrays of an archive, read when they are asked for."""
+
+    def __init__(self, streams: NpzStreams) -> None:
+        self._streams = streams
+        # The arrays of a name: one, or those of a group.
+        self._parts: dict[str, list[str]] = {}
+        for name, kind in streams.kinds.items():
+            group = name.split("/")[0]
+            if kind.shape:
+                whole = group if group in _ARGUMENTS else name
+                self._parts.setdefault(whole, []).append(name)
+
+    def __getitem__(self, name: str) -> Any:
+        tree: dict[str, Any] = {}
+        for part in self._parts[name]:
+            array = self._streams.take(part, self._streams.kinds[part].shape[0])
+            if part == name:
+                return array
+            *above, last = part.split("/")[1:]
+            inner = tree
+            for group in above:
+                inner = inner.setdefault(group, {})
+            inner[last] = array
+        return tree
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._parts
 
 
 def _tree(item: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +16,10 @@ from torchrl_caiac.data.digests import file_digest
 from torchrl_caiac.data.episodes import episode_transitions
 from torchrl_caiac.data.join_columns import column_ranges, join_columns
 from torchrl_caiac.data.minari_checks import check_hdf5_group
+from torchrl_caiac.data.robomimic_settings import (
+    controller_bounds,
+    environment_settings,
+)
 from torchrl_caiac.data.write_episodes import Part, write_episodes
 
 __all__ = ["load_robomimic"]
@@ -60,8 +63,9 @@ def load_robomimic(
     ``"observation"``. The columns of each are then logged, and stored as ``"columns"``
     of :func:`~torchrl_caiac.data.digests.data_source`.
 
-    The next observations are those of ``next_obs``. Without them, the last action of
-    each demonstration has no next observation, and its row is left out.
+    The next observations are those of ``next_obs``. Without them, and without one
+    observation more than actions, the last action of each demonstration has no next
+    observation, and its row is left out.
 
     A demonstration ends when the recording does, also after a success: robosuite's
     environments go on. Hence its last row counts as truncated. ``dones`` are kept with
@@ -93,9 +97,9 @@ def load_robomimic(
             ``"after"`` for files with the attribute ``bddl_file_name``, which LIBERO
             writes so, else ``"before"``, as robomimic writes them.
         action_bounds (tuple of sequences, optional): the lowest and the highest action,
-            see :func:`~torchrl_caiac.data.action_bounds`. Those of robosuite's
-            controllers are usually -1 and 1; the file does not say so. Defaults to
-            ``None``: unknown.
+            see :func:`~torchrl_caiac.data.action_bounds`. Defaults to ``None``: -1 and
+            1 if the attribute ``env_args`` says that robosuite's controllers take
+            inputs from -1 to 1, and all actions are; else unknown.
         overwrite (bool): whether to replace ``path`` if it exists. Defaults to
             ``False``.
         progress (bool): whether to show a progress bar over the demonstrations.
@@ -172,11 +176,13 @@ def load_robomimic(
             "format": "robomimic",
             "dataset": file.name,
             "sha256": file_digest(file),
-            "env_name": _env_name(stored["data"]),
+            "env_name": environment_settings(stored["data"]).get("env_name"),
             "mask": mask,
             "columns": columns,
             **{name: value for name, value in options._asdict().items() if value},
         }
+        if action_bounds is None:
+            action_bounds = controller_bounds(stored["data"], demos, file)
         return write_episodes(
             _parts(stored["data"], demos, file, options),
             path,
@@ -250,19 +256,12 @@ def _demos(stored: Any, file: Path, mask: str | None) -> list[str]:
     return sorted(set(names), key=lambda name: int(name.removeprefix("demo_")))
 
 
-def _env_name(data: Any) -> str | None:
-    """Returns the name of the environment, if the file has it."""
-    try:
-        name = json.loads(data.attrs["env_args"])["env_name"]
-    except (KeyError, TypeError, ValueError):  # it is only a remark
-        return None
-    return name if isinstance(name, str) else None
-
-
 def _announce(demo: Any, where: str, options: _Options) -> dict[str, list[int]] | None:
     """Logs what is left out or joined, and returns the columns of what is joined."""
     observations = _group(demo, "obs", where)
-    if "next_obs" not in demo:
+    seen = [item for item in observations.values() if getattr(item, "shape", None)]
+    rows = {len(item) for item in seen} - {len(demo.get("actions", ())) + 1}
+    if "next_obs" not in demo and rows:
         _logger.info(
             "%s has no next_obs: the %s row of each demonstration is left out, because "
             "its action has no %sobservation",
@@ -343,11 +342,11 @@ def _transitions(demo: Any, file: Path, where: str, options: _Options) -> Tensor
                     f"{where} has no {name!r}, it has {sorted(demo)}: correct the file"
                     f"{' or infos=' if name in options.infos else ''}"
                 )
-        actions = demo["actions"][()]
+        actions = _read(demo["actions"])
         # LIBERO stores them as uint8.
         rewards = demo["rewards"][()].astype(float) if "rewards" in demo else None
         infos = {name: _read(demo[name]) for name in options.infos}
-    except (OSError, RuntimeError, ValueError) as error:
+    except (AttributeError, OSError, RuntimeError, TypeError, ValueError) as error:
         if isinstance(error, UnreadableFileError) or where in str(error):
             raise
         raise UnreadableFileError(
@@ -358,8 +357,9 @@ def _transitions(demo: Any, file: Path, where: str, options: _Options) -> Tensor
             f"{where} has next_obs, so its observations are those before the actions: "
             "leave out observed="
         )
-    if not has_next:
-        length = _rows(states)
+    length = _rows(states)
+    # One state more than actions is the last one, as in episode_transitions.
+    if not has_next and length != len(actions) + 1:
         if len(actions) != length:
             raise ValueError(
                 f"{where} has {len(actions)} actions and {length} observations, "

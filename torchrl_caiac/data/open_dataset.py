@@ -73,15 +73,20 @@ def open_dataset(
 ) -> TensorDict:
     """Converts a dataset of any known format to transitions, and opens them.
 
-    | source | format | loader |
-    |---|---|---|
-    | a folder of transitions | ``transitions`` | opened where it is |
-    | a Minari id, ``minari://ID``, or its folder | ``minari`` | ``load_minari`` |
-    | a LeRobot folder, or ``lerobot://REPO`` | ``lerobot`` | ``load_lerobot`` |
-    | OGBench's ``.npz``, or ``ogbench://NAME`` | ``ogbench`` | ``load_ogbench`` |
-    | another ``.npz`` with arrays | ``npz`` | ``from_arrays`` |
-    | HDF5 with ``data/demo_*`` | ``robomimic`` | ``load_robomimic`` |
-    | another HDF5 with arrays, as D4RL's | ``hdf5`` | ``from_arrays`` |
+    The formats, and what reads them:
+
+    - ``transitions``: a folder of transitions, which is opened where it is;
+    - ``minari``: the id of a Minari dataset on this machine, ``minari://ID``, or its
+      folder: :func:`~torchrl_caiac.data.load_minari`;
+    - ``lerobot``: a LeRobot folder, or ``lerobot://REPO``:
+      :func:`~torchrl_caiac.data.load_lerobot`;
+    - ``ogbench``: OGBench's ``.npz``, or ``ogbench://NAME``:
+      :func:`~torchrl_caiac.data.load_ogbench`;
+    - ``npz``: another ``.npz`` with arrays named as the arguments of
+      :func:`~torchrl_caiac.data.from_arrays`;
+    - ``robomimic``: HDF5 with ``data/demo_*``:
+      :func:`~torchrl_caiac.data.load_robomimic`;
+    - ``hdf5``: another HDF5 with such arrays, as those of D4RL.
 
     Names with ``://`` are downloaded if they are not on this machine.
 
@@ -227,7 +232,8 @@ def _names_in_npz(path: Path) -> set[str]:
     if path.suffix != ".npz":
         return set()
     with NpzStreams(path, "file of arrays", _AGAIN) as arrays:
-        return set(arrays.kinds)
+        # Arrays of a group are named "observations/arm".
+        return {name.split("/")[0] for name in arrays.kinds}
 
 
 def _is_ogbench(path: Path) -> bool:

@@ -20,7 +20,7 @@ from torchrl_caiac._keys import leaf_names
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac._torchrl import file_name
 from torchrl_caiac.data.action_bounds import check_action_bounds, write_action_bounds
-from torchrl_caiac.data.digests import write_digests
+from torchrl_caiac.data.digests import tensor_bytes, write_digests
 from torchrl_caiac.data.write_transitions import (
     check_bounds_fit,
     check_entries,
@@ -261,7 +261,7 @@ class TransitionWriter:
 
     def _write(self, key: _Key, leaf: torch.Tensor) -> None:
         file = self._files[key]
-        content = leaf.contiguous().reshape(-1).view(torch.uint8).numpy().data
+        content = tensor_bytes(leaf)
         try:
             file.write(content)
             file.flush()

@@ -66,7 +66,8 @@ class ThresholdSuggestions:
     Args:
         thresholds (dict of str to float): for ``CAIACTransform(threshold=...)``. Below
             all scores where nothing of the entity may be swapped: if it is always
-            influenced, or if no clear threshold was found.
+            influenced, or if no clear threshold was found. Twice the highest score if
+            it is never influenced.
         confidence (dict of str to str): ``"two clear modes"``; ``"one mode: never
             influenced"``, so that all rows are free; ``"one mode: always influenced"``
             or ``"unclear"``, so that none is.
@@ -310,7 +311,7 @@ def suggest_thresholds(
     if second_key is not None:
         other = _scores(data, as_key(second_key), layout, length)
         second = _picked(other, rows)
-    lowest, highest, _ = score_limits(scores)
+    lowest, _, _ = score_limits(scores)
     confidence: dict[str, Confidence] = {}
     thresholds, splits, reasons, histograms = {}, {}, {}, {}
     for name in names:
@@ -324,7 +325,8 @@ def suggest_thresholds(
         confidence[name], reasons[name] = split.confidence, split.reason
         if not np.isnan(split.threshold):
             splits[name] = split.threshold
-        thresholds[name] = _threshold(split, lowest[place], highest[place])
+        highest = float(values[known].max(initial=-np.inf))
+        thresholds[name] = _threshold(split, lowest[place], highest)
         histograms[name] = _histogram(values[known], moves, known)
     free = _free_shares(scores, [layout.index(n) for n in names], thresholds)
     return ThresholdSuggestions(
@@ -432,7 +434,8 @@ def _threshold(split: Split, lowest: float, highest: float) -> float:
     if split.confidence == "two clear modes":
         return split.threshold
     if split.confidence == "one mode: never influenced":
-        # Above all scores, also those of similar rows that come later.
+        # Above the scores of the rows that were looked at, and of similar ones; a row
+        # that scores much more than these is not known to be uninfluenced.
         return 2 * highest if highest > 0 else DEFAULT_THRESHOLD
     return min(-1.0, 2 * lowest)  # below all scores
 

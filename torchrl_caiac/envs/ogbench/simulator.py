@@ -66,6 +66,7 @@ class OGBenchSimulator:
 
     def __init__(self, name: str = "cube-double") -> None:
         import mujoco
+        from gymnasium.spaces import Box
 
         self._mujoco = mujoco
         self.name = name
@@ -75,7 +76,7 @@ class OGBenchSimulator:
         self._env.reset(seed=0)
         self._task = self._env.unwrapped
         #: The box of the actions, [-1, 1].
-        self.action_space = self._task.action_space
+        self.action_space = Box(-1.0, 1.0, (5,), np.float32)
         joints = entity_joints(name)
         model = self.model
         #: Where in ``qpos`` each entity is.
