@@ -49,9 +49,7 @@ def test_models_read_and_predict_the_position_of_the_hand(steps, cfg):
 def test_the_sweep_has_a_line_for_each_floor_and_entity(steps, cfg, tmp_path):
     lines = steps.sweep_variance_floor.sweep(cfg)
     assert [(line["floor"], line["entity"]) for line in lines] == [
-        (floor, cube)
-        for floor in ("1 mm", "auto")
-        for cube in ("cube0", "cube1")
+        (floor, cube) for floor in ("1 mm", "auto") for cube in ("cube0", "cube1")
     ]
     for line in lines[:2]:
         torch.testing.assert_close(line["value"], 1e-3)
