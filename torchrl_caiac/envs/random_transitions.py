@@ -93,7 +93,7 @@ def random_transitions(
     raise the AUC of CAI from 0.96 to 0.99, and the kitchen uses as many as it has
     demonstrations. They are for the world model alone:
     :func:`~torchrl_caiac.data.mix_trajectories` mixes them with the data, and
-    :func:`~torchrl_caiac.fit_world_model` takes the mixture.
+    :func:`~torchrl_caiac.fit.fit_world_model` takes the mixture.
 
     The transitions ``[T]`` with ``T = S * actions_per_state * steps`` have
     ``"observation"``, ``"action"``, ``"episode"`` (int64 ``[T]``) and, under
