@@ -150,6 +150,13 @@ def test_columns_that_never_move_are_left_out_or_with_their_group() -> None:
     assert "columns 5 " in note
 
 
+def test_a_single_column_between_those_of_the_robot_is_its_own() -> None:
+    states, action = world(2, [1, 2], 0)
+    states = states[:, [0, 2, 1, 3, 4]]
+    found = inspect_dataset(transitions(states, action))
+    assert list(found.proposal.columns.values()) == [(0, 1, 2), (3, 4)]
+
+
 def test_no_robot_is_said() -> None:
     states, action = world(2, [2, 2], 0)
     found = inspect_dataset(transitions(states[:, 2:], action))

@@ -54,13 +54,17 @@ OPTIONAL = (
 )
 CORE = (
     "torchrl_caiac",
+    "torchrl_caiac.augment",
     "torchrl_caiac.checkpoint",
+    "torchrl_caiac.cli",
     "torchrl_caiac.data",
     "torchrl_caiac.evaluation",
     "torchrl_caiac.fit",
     "torchrl_caiac.influence",
+    "torchrl_caiac.inspection",
     "torchrl_caiac.modules",
     "torchrl_caiac.objectives",
+    "torchrl_caiac.scored",
     "torchrl_caiac.transforms",
 )
 

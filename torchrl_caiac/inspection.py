@@ -425,7 +425,7 @@ def _column_groups(
             count += 1
             owner.append(count)
         last = owner[-1]
-    owner = _merged(owner, together)
+    owner = _merged(_inside_robot(owner), together)
     unmoved = tuple(c for c, mine in enumerate(owner) if mine < 0)
     for column in unmoved:  # inside of a group, it belongs to the group
         before = [mine for mine in owner[:column] if mine >= 0][-1:]
@@ -450,6 +450,16 @@ def _column_groups(
         )
         for number in found
     ]
+
+
+def _inside_robot(owner: list[int]) -> list[int]:
+    """Gives single columns between columns of the robot to it: a joint that waits."""
+    owner = list(owner)
+    for column in range(1, len(owner) - 1):
+        is_alone = owner.count(owner[column]) == 1
+        if is_alone and owner[column - 1] == owner[column + 1] == 0:
+            owner[column] = 0
+    return owner
 
 
 def _merged(owner: list[int], together: torch.Tensor) -> list[int]:

@@ -402,7 +402,7 @@ def _check_tables(tables: Mapping[str, Any], layout: EntityLayout) -> None:
                     f"{name} of {entity!r} is {value!r}, expected "
                     f"{'a text' if kinds == (str,) else 'a number'}"
                 )
-            if not isinstance(value, str) and not math.isfinite(value):
+            if isinstance(value, (int, float)) and not math.isfinite(value):
                 raise ValueError(f"{name} of {entity!r} is {value}, not finite")
         missing = expected - set(table)
         if missing:

@@ -67,6 +67,8 @@ def test_the_result_is_that_of_from_arrays(tmp_path, name):
     assert data["next", "terminated"].sum() == 1
     again = load(tmp_path / name)
     assert (data == again).all()
+    with pytest.raises(FileExistsError, match=r"overwrite=True"):
+        load(write(tmp_path / name, arrays(), rewards=np.zeros(9)))
 
 
 def test_other_names_of_the_ends_are_known(tmp_path, name):
@@ -118,8 +120,8 @@ def test_exported_transitions_are_read_back(tmp_path, export, is_nested):
         ({"actions": None}, {}, KeyError, r"a\.\w+ lacks \['actions'\], it has \["),
         ({}, {"infos": ["cup"]}, KeyError, r"lacks \['cup'\]"),
         ({}, {"exclude": ["cup"]}, KeyError, r"lacks \['cup'\]"),
-        ({"terminals": None, "timeouts": None}, {}, ValueError, r"end"),
-        ({"rewards": np.full(9, np.nan)}, {}, ValueError, r"'reward'.*NaN"),
+        ({"terminals": None, "timeouts": None}, {}, ValueError, r"a\.\w+: .* end"),
+        ({"rewards": np.full(9, np.nan)}, {}, ValueError, r"a\.\w+: 'reward'.*NaN"),
     ],
 )
 def test_errors_leave_nothing(tmp_path, name, changes, options, error, message):
@@ -138,6 +140,22 @@ def test_files_cut_short_are_refused(tmp_path, name):
         load(file)
     with pytest.raises(FileNotFoundError, match=r"no file .*other"):
         load(file.with_name("other.npz"))
+
+
+def test_damaged_parts_are_refused(tmp_path):
+    states = np.random.default_rng(0).normal(size=(9, 3))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for key, array in arrays().items():
+            file[key] = array
+        del file["observations"]
+        stored = file.create_dataset("observations", data=states, compression="gzip")
+        place = stored.id.get_chunk_info(0).byte_offset
+    content = bytearray((tmp_path / "a.h5").read_bytes())
+    content[place : place + 20] = bytes(20)
+    (tmp_path / "a.h5").write_bytes(content)
+    with pytest.raises(UnreadableFileError, match=r"a.h5 cannot be read"):
+        load(tmp_path / "a.h5")
+    assert os.listdir(tmp_path) == ["a.h5"]
 
 
 def test_without_h5py_the_package_is_named(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -147,7 +148,7 @@ def augment_dataset(
         write_digests(folder, source=source)
         if bounds is not None:
             write_action_bounds(folder, *bounds)
-    return load_transitions(path)
+    return load_transitions(Path(path))
 
 
 def _count(ratio: float, originals: int) -> int:

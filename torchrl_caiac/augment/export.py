@@ -74,7 +74,8 @@ def export_npz(
         ... )
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     file = export_npz(rows, f"{folder}/rows.npz")
-        ...     sorted(np.load(file))
+        ...     with np.load(file, allow_pickle=False) as stored:
+        ...         sorted(stored)
         ['actions', 'observations']
     """
     check_free(path, overwrite)

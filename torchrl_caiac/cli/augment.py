@@ -6,7 +6,7 @@ import argparse
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tensordict import TensorDict, TensorDictBase
 
@@ -160,8 +160,8 @@ def _write(
     if kind == "folder":
         return _summary(_augmented(args, scored, Path(args.out), console), scored, args)
     if kind == "minari":
-        with tempfile.TemporaryDirectory(prefix="caiac-") as work:
-            data = _augmented(args, scored, Path(work) / "data", console)
+        with tempfile.TemporaryDirectory(prefix="caiac-") as folder:
+            data = _augmented(args, scored, Path(folder) / "data", console)
             with console.step("writing the Minari dataset"):
                 to_minari(
                     _with_infos(data),
@@ -196,7 +196,9 @@ def _with_infos(data: TensorDictBase) -> TensorDict:
 def _augmented(
     args: argparse.Namespace, scored: ScoredDataset, path: Path, console: Console
 ) -> Any:
-    kind = "trajectories" if args.trajectories else "transitions"
+    kind: Literal["transitions", "trajectories"] = (
+        "trajectories" if args.trajectories else "transitions"
+    )
     with console.step(f"making counterfactual {kind}"):
         return augment_dataset(
             scored,

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,10 +19,12 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import (
     CAI,
+    DEFAULT_FIT,
     AttentionInfluence,
     DistanceInfluence,
     MotionInfluence,
     ResidualInfluence,
+    default_world_model,
 )
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
@@ -113,16 +115,12 @@ def _distance(context: Context) -> DistanceInfluence:
 
 def _cai(context: Context) -> CAI:
     def new() -> GaussianWorldModel:
-        return GaussianWorldModel(
-            context.layout,
-            _action_dim(context.data),
-            predict=context.layout.positions or None,
-            widths=_widths(context),
-            variance_floor=_floor(context),
+        return default_world_model(
+            context.layout, _action_dim(context.data), widths=_widths(context)
         )
 
     model = _fitted(context, new)
-    return CAI(model, num_actions=context.settings["num_actions"])  # type: ignore[arg-type]
+    return CAI(model, num_actions=context.settings["num_actions"])
 
 
 def _attention(context: Context) -> AttentionInfluence:
@@ -131,14 +129,14 @@ def _attention(context: Context) -> AttentionInfluence:
             context.layout,
             _action_dim(context.data),
             widths=_widths(context),
-            variance_floor=_floor(context),
+            variance_floor=None if context.layout.variance_floor else "auto",
         )
 
     model = _fitted(context, new)
-    return AttentionInfluence(model, action_only=True)  # type: ignore[arg-type]
+    return AttentionInfluence(model, action_only=True)
 
 
-_FIT: dict[str, Any] = {"steps": 20_000, "seed": 0, "world_model": None}
+_FIT: dict[str, Any] = {"steps": DEFAULT_FIT["steps"], "seed": 0, "world_model": None}
 
 #: By name. The first one is the default.
 ESTIMATORS: dict[str, EstimatorEntry] = {
@@ -329,11 +327,6 @@ def _widths(context: Context) -> dict[str, int] | None:
     return None if context.layout.is_flat else context.layout.widths(context.data[:1])
 
 
-def _floor(context: Context) -> Literal["auto"] | None:
-    """Returns that the layout's floor is used, or one that is found in the data."""
-    return None if context.layout.variance_floor else "auto"
-
-
 def _fitted(
     context: Context, new: Callable[[], EntityDynamicsModel]
 ) -> EntityDynamicsModel:
@@ -349,7 +342,7 @@ def _fitted(
         fit_world_model(
             model,
             [context.data, *context.more],
-            steps=settings["steps"],
+            **{**DEFAULT_FIT, "steps": settings["steps"]},
             seed=settings["seed"],
             checkpoint=folder / _CHECKPOINT,
             progress=context.console.progress,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
 from torchrl_caiac.cli.sources import add_data, open_data
+from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.inspection import inspect_dataset
 
 __all__ = ["add_parser", "run"]
@@ -40,6 +42,14 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
     return parser
 
 
+def _yaml(layout: EntityLayout) -> str:
+    """Returns a layout in the form in which people write it."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "layout.yaml"
+        layout.save(file)
+        return file.read_text(encoding="utf-8").rstrip()
+
+
 def run(args: argparse.Namespace, console: Console) -> int:
     """Runs the command."""
     file = None if args.write_layout is None else Path(args.write_layout)
@@ -56,7 +66,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     console.text(str(found))
     if found.proposal is not None:
         console.text("\nproposed layout (rename its entities, and check it):")
-        console.text(str(found.proposal))
+        console.text(_yaml(found.proposal))
         if file is not None:
             found.proposal.save(file)
             document["written"] = str(file)

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac.data.from_arrays import from_arrays
+from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
 from torchrl_caiac.data.minari_checks import check_hdf5_group
 from torchrl_caiac.data.npz_streams import NpzStreams
 
@@ -134,16 +135,30 @@ def load_array_file(
                 "%s of %s are left out; pass infos= to keep some", left_out, file
             )
         kept = {argument: arrays[name] for name, argument in used.items()}
-        return from_arrays(
-            kept.pop("observations"),
-            kept.pop("actions"),
-            path,
-            **kept,
-            info={name: arrays[name] for name in infos} or None,
-            action_bounds=action_bounds,
-            overwrite=overwrite,
-            progress=progress,
-        )
+        try:
+            return from_arrays(
+                kept.pop("observations"),
+                kept.pop("actions"),
+                path,
+                **kept,
+                info={name: arrays[name] for name in infos} or None,
+                action_bounds=action_bounds,
+                overwrite=overwrite,
+                progress=progress,
+            )
+        except UnreadableFileError:
+            raise
+        except (TypeError, ValueError) as error:
+            # These name the arrays alone.
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(f"{file}: {error}") from error
+        except OSError as error:
+            # h5py's has no number: a part cannot be decompressed.
+            if type(error) is not OSError or error.errno is not None:
+                raise
+            raise UnreadableFileError(
+                f"{file} cannot be read, it may be damaged ({error}): {_AGAIN}"
+            ) from error
 
 
 def _arrays(file: Path, stack: ExitStack) -> Mapping[str, Any]:
@@ -151,30 +166,16 @@ def _arrays(file: Path, stack: ExitStack) -> Mapping[str, Any]:
     if file.suffix == ".npz":
         streams = stack.enter_context(NpzStreams(file, "file of arrays", _AGAIN))
         return _Archive(streams)
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(
-            f"{file} needs the package h5py: install it with "
-            "pip install 'torchrl-caiac[robomimic]'"
-        ) from error
-    try:
-        stored = stack.enter_context(h5py.File(file, "r"))
+    stored = stack.enter_context(open_hdf5(file))
+    with reading_hdf5(file):
         check_hdf5_group(stored, file)
-    except (OSError, RuntimeError, ValueError) as error:
-        if isinstance(error, UnreadableFileError):
-            raise
-        raise UnreadableFileError(
-            f"{file} is not a readable HDF5 file, it may be truncated or damaged "
-            f"({error}): {_AGAIN}"
-        ) from error
-    found: dict[str, Any] = {}
-    for name, item in stored.items():
-        if not isinstance(item, h5py.Group) or name in _ARGUMENTS:
-            found[name] = _tree(item)
-        else:
-            found |= {f"{name}/{inner}": _tree(item[inner]) for inner in item}
-    return found
+        found: dict[str, Any] = {}
+        for name, item in stored.items():
+            if hasattr(item, "keys") and name not in _ARGUMENTS:
+                found |= {f"{name}/{inner}": _tree(item[inner]) for inner in item}
+            else:
+                found[name] = _tree(item)
+        return found
 
 
 class _Archive(Mapping[str, Any]):

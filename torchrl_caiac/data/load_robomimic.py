@@ -11,9 +11,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from tensordict import TensorDict
 
-from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac.data.digests import file_digest
 from torchrl_caiac.data.episodes import episode_transitions
+from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
 from torchrl_caiac.data.join_columns import column_ranges, join_columns
 from torchrl_caiac.data.minari_checks import check_hdf5_group
 from torchrl_caiac.data.robomimic_settings import (
@@ -26,7 +26,6 @@ __all__ = ["load_robomimic"]
 
 _logger = logging.getLogger("torchrl_caiac.data.load_robomimic")
 
-_AGAIN = "download or collect the dataset again"
 # LIBERO writes this attribute, and the observation *after* each action.
 _LIBERO = "bddl_file_name"
 
@@ -146,7 +145,6 @@ def load_robomimic(
         torch.Size([6, 13])
         >>> folder.cleanup()
     """
-    h5py = _h5py()
     if observed not in (None, "before", "after"):
         raise ValueError(
             f"observed is {observed!r}, expected 'before', 'after' or None"
@@ -159,32 +157,35 @@ def load_robomimic(
             "at least one, and images= and exclude= do not apply: leave these out"
         )
     file = Path(file)
-    with _opened(h5py, file) as stored:
-        demos = _demos(stored, file, mask)
-        is_after = observed == "after" or (
-            observed is None and _LIBERO in stored["data"].attrs
-        )
-        options = _Options(
-            None if keys is None else tuple(keys),
-            tuple(images),
-            tuple(infos),
-            tuple(exclude),
-            is_after,
-        )
-        columns = _announce(stored["data"][demos[0]], f"{demos[0]} of {file}", options)
+    with open_hdf5(file) as stored:
+        with reading_hdf5(file):
+            data = stored.get("data")
+            demos = _demos(stored, file, mask)
+            is_after = observed == "after" or (
+                observed is None and _LIBERO in data.attrs
+            )
+            options = _Options(
+                None if keys is None else tuple(keys),
+                tuple(images),
+                tuple(infos),
+                tuple(exclude),
+                is_after,
+            )
+            columns = _announce(data[demos[0]], f"{demos[0]} of {file}", options)
+            settings = environment_settings(data)
+            if action_bounds is None:
+                action_bounds = controller_bounds(data, demos, file)
         source = {
             "format": "robomimic",
             "dataset": file.name,
             "sha256": file_digest(file),
-            "env_name": environment_settings(stored["data"]).get("env_name"),
+            "env_name": settings.get("env_name"),
             "mask": mask,
             "columns": columns,
             **{name: value for name, value in options._asdict().items() if value},
         }
-        if action_bounds is None:
-            action_bounds = controller_bounds(stored["data"], demos, file)
         return write_episodes(
-            _parts(stored["data"], demos, file, options),
+            _parts(data, demos, file, options),
             path,
             source=source,
             action_bounds=action_bounds,
@@ -200,30 +201,9 @@ def _parts(
 ) -> Iterator[Part]:
     for name in demos:
         where = f"{name} of {file}"
-        yield Part(_transitions(data[name], file, where, options), where)
-
-
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(
-            "robomimic datasets need the package h5py: install it with "
-            "pip install 'torchrl-caiac[robomimic]'"
-        ) from error
-    return h5py
-
-
-def _opened(h5py: Any, file: Path) -> Any:
-    if not file.exists():
-        raise FileNotFoundError(f"there is no file {file}: give another one")
-    try:
-        return h5py.File(file, "r")
-    except OSError as error:
-        raise UnreadableFileError(
-            f"{file} is not a readable HDF5 file, it may be truncated or damaged "
-            f"({error}): {_AGAIN}"
-        ) from error
+        with reading_hdf5(file):
+            demo = data[name]
+        yield Part(_transitions(demo, file, where, options), where)
 
 
 def _demos(stored: Any, file: Path, mask: str | None) -> list[str]:
@@ -327,7 +307,7 @@ def _selected(observations: Any, options: _Options, where: str) -> dict[str, Any
 
 
 def _transitions(demo: Any, file: Path, where: str, options: _Options) -> TensorDict:
-    try:
+    with reading_hdf5(file):
         check_hdf5_group(demo, file)
         states = _states(_group(demo, "obs", where), options, where)
         has_next = "next_obs" in demo
@@ -346,12 +326,6 @@ def _transitions(demo: Any, file: Path, where: str, options: _Options) -> Tensor
         # LIBERO stores them as uint8.
         rewards = demo["rewards"][()].astype(float) if "rewards" in demo else None
         infos = {name: _read(demo[name]) for name in options.infos}
-    except (AttributeError, OSError, RuntimeError, TypeError, ValueError) as error:
-        if isinstance(error, UnreadableFileError) or where in str(error):
-            raise
-        raise UnreadableFileError(
-            f"{where} cannot be read ({error}): {_AGAIN}"
-        ) from error
     if has_next and options.is_after:
         raise ValueError(
             f"{where} has next_obs, so its observations are those before the actions: "

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from tensordict import TensorDict
 
-from torchrl_caiac._files import UnreadableFileError
+from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
 from torchrl_caiac.data.load_array_file import load_array_file
 from torchrl_caiac.data.load_lerobot import load_lerobot
 from torchrl_caiac.data.load_minari import load_minari
@@ -246,21 +246,8 @@ def _is_ogbench(path: Path) -> bool:
 def _names_in_hdf5(path: Path) -> set[str]:
     if path.suffix not in _HDF5:
         return set()
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(
-            f"{path} needs the package h5py: install it with "
-            "pip install 'torchrl-caiac[robomimic]'"
-        ) from error
-    try:
-        with h5py.File(path, "r") as stored:
-            return set(stored)
-    except (OSError, RuntimeError) as error:
-        raise UnreadableFileError(
-            f"{path} is not a readable HDF5 file, it may be truncated or damaged "
-            f"({error}): {_AGAIN}"
-        ) from error
+    with open_hdf5(path) as stored, reading_hdf5(path):
+        return {str(name) for name in stored}
 
 
 def _is_arrays(names: set[str]) -> bool:

@@ -36,7 +36,7 @@ def environment_settings(data: Any) -> dict[str, Any]:
     """
     try:
         content = json.loads(data.attrs["env_args"])
-    except (KeyError, TypeError, ValueError, RecursionError):  # it is only a remark
+    except Exception:  # h5py and JSON raise many kinds, and it is only a remark
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -167,12 +167,13 @@ class TransitionWriter:
             )
         self._check(episode, where, ends)
         ids = torch.full((len(episode),), self.episodes)
-        rows = episode.detach().cpu().exclude().set("episode", ids)
+        rows = episode.copy().set("episode", ids)  # without a copy of the leaves
         if self._first is None:
             check_entries(rows, where)
             if self._bounds is not None:
                 check_bounds_fit(rows, self._bounds)
-            self._first, self._first_name = rows[:1].clone(), where
+            first = rows[:1].detach().cpu().clone()
+            self._first, self._first_name = first, where
             self._kinds = _kinds(rows)
             self._open_files(self._folder)
         self._check_kinds(_kinds(rows), where)
