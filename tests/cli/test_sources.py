@@ -218,11 +218,16 @@ def test_data_that_cannot_be_read(
     assert result.code == 1
     for word in words:
         assert word in result.error
-    # Nothing half-written stays; the folder remembers what it was for.
-    left = {
-        p for p in set(Path.cwd().rglob("*")) - before if not p.name.startswith(".")
-    }
-    assert {p.name for p in left} <= {"scored", "source.json"}
+    assert set(Path.cwd().rglob("*")) == before  # nothing half-written stays
+
+
+def test_a_folder_is_free_for_other_data_after_an_error(
+    caiac: Caiac, pushes: Path
+) -> None:
+    Path("scored").mkdir()
+    to = ("--layout", "layout.json", "--out", "scored")
+    assert caiac("score", not_finite(), *to).code == 1
+    assert caiac("score", pushes, *to).code == 0
 
 
 def test_episodes_of_one_row(caiac: Caiac, pushes: Path) -> None:

@@ -129,11 +129,10 @@ class Console:
     def step(self, name: str) -> Iterator[None]:
         """Writes the name of a step, and the seconds that it took if it took some."""
         begin = time.perf_counter()
-        if not self._is_terminal:
-            self.note(f"{name} ...")
+        self.note(f"{name} ...")
         yield
         seconds = time.perf_counter() - begin
-        if self._is_terminal or seconds >= 1:
+        if seconds >= 1:
             self.note(f"{name}: {seconds:.0f} s")
 
     # --- redirection -----------------------------------------------------------------

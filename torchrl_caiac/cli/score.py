@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchrl_caiac._files import claim_folder, read_json, write_json
+from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.check import check_dataset
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
@@ -24,6 +24,7 @@ from torchrl_caiac.cli.sources import (
     describe_source,
     loader_options,
     open_named,
+    own_folder,
     read_layout,
     remove_scores,
 )
@@ -105,7 +106,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     folder = Path(args.out)
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is a file: give a folder")
-    with claim_folder(folder):
+    with own_folder(folder):
         data = convert(args.data, folder, described, console, overwrite=args.overwrite)
         replace = _settle(args, layout, settings, folder)
         context = Context(
