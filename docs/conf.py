@@ -70,6 +70,7 @@ html_title = "torchrl-caiac"
 html_show_sourcelink = False
 # Pages without subpages have no navigation to show beside them.
 html_sidebars = {
-    page: [] for page in ("index", "usage", "results", "performance", "changelog")
+    page: []
+    for page in ("index", "usage", "report", "results", "performance", "changelog")
 }
 html_theme_options = {"show_prev_next": False, "navigation_with_keys": False}

@@ -1,8 +1,8 @@
 """Compares variance floors of the world model by the ground truth of the simulator.
 
-``python sweep_variance_floor.py env=fetch_push`` fits one short model for each floor,
-for that of the layout and for ``"auto"``, and scores held-out rows. Finished fits are
-kept. OGBench's positions are scaled: ``env=ogbench_cube_double unit=10``.
+``python sweep_variance_floor.py env=fetch_push`` fits one short model for each floor
+and for ``"auto"``, and scores held-out rows. Finished fits are kept. OGBench's
+positions are scaled: ``env=ogbench_cube_double unit=10``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ COLUMNS = (
 def floors(cfg: DictConfig) -> dict[str, Any]:
     """Returns the floors by name, in the units of the data."""
     given = {f"{1000 * floor:g} mm": floor * cfg.unit for floor in cfg.floors}
-    return {**given, "layout": None, "auto": "auto"}
+    return {**given, "auto": "auto"}
 
 
 def fit_floor(

@@ -25,7 +25,12 @@ from torchrl_caiac.evaluation import (
     Candidate,
     compare_influence,
 )
-from torchrl_caiac.influence import CAI, AttentionInfluence, score_buffer
+from torchrl_caiac.influence import (
+    CAI,
+    AttentionInfluence,
+    MotionInfluence,
+    score_buffer,
+)
 from torchrl_caiac.modules import (
     GaussianWorldModel,
     GoalConditionedActor,
@@ -155,6 +160,16 @@ def scored(flat_data: TensorDictBase) -> TensorDictBase:
 
 
 in_memory = pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)
+
+
+@in_memory
+def test_motion_as_the_estimator(flat_data: TensorDictBase) -> None:
+    rb = offline_buffer(flat_data, batch_size=8)
+    scope = run_usage(
+        "estimator = MotionInfluence", rb=rb, MotionInfluence=MotionInfluence
+    )
+    assert rb.storage[:]["caiac", "score"].shape == (len(flat_data), 3)
+    assert scope["estimator"].fitted
 
 
 @in_memory

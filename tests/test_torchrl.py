@@ -206,12 +206,10 @@ def test_prefetched_batches_are_dropped(rb):
 
 def test_a_loaded_folder_becomes_memory_mapped(tmp_path):
     rows(3).memmap(tmp_path)
-    for tell in (fence.mark_memmap, fence.known_to_be_memmap):
-        loaded = TensorDict.load_memmap(tmp_path)
-        tell(loaded)
-        assert loaded.is_memmap() and loaded["next"].is_memmap()
-        assert fence.memmap_folder(loaded) == str(tmp_path)
-    assert not fence.known_to_be_memmap(rows(3))
+    loaded = TensorDict.load_memmap(tmp_path)
+    fence.mark_memmap(loaded)
+    assert loaded.is_memmap() and loaded["next"].is_memmap()
+    assert fence.memmap_folder(loaded) == str(tmp_path)
     assert fence.memmap_folder(rows(3)) is None
 
 

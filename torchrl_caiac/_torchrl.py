@@ -11,7 +11,7 @@ import sys
 from typing import Any
 
 import torch
-from tensordict import MemoryMappedTensor, TensorDictBase, is_tensor_collection
+from tensordict import TensorDictBase, is_tensor_collection
 from tensordict._utils_key_json import _encode_key_for_filesystem
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -26,7 +26,6 @@ __all__ = [
     "file_name",
     "forget_leaves",
     "is_in_order_of_time",
-    "known_to_be_memmap",
     "last_written",
     "linear_pointwise",
     "loss_masks",
@@ -263,15 +262,6 @@ def mark_memmap(td: TensorDictBase) -> None:
     nodes = (v for v in td.values(True) if isinstance(v, TensorDictBase))
     for node in (td, *nodes):
         node._is_memmap = True
-
-
-def known_to_be_memmap(td: TensorDictBase) -> bool:
-    """Returns whether a tensordict is memory-mapped, after flagging a loaded one."""
-    if not td.is_memmap() and memmap_folder(td) is not None:
-        leaves = td.values(include_nested=True, leaves_only=True)
-        if all(isinstance(leaf, MemoryMappedTensor) for leaf in leaves):
-            mark_memmap(td)
-    return td.is_memmap()
 
 
 def drop_memmap_leaf(td: TensorDictBase, key: NestedKey) -> None:

@@ -18,9 +18,6 @@ from torchrl_caiac.layouts import ready_layout
 
 __all__ = ["OGBench"]
 
-# Of the robot, without its joints: position, yaw and opening of the hand, contact.
-HAND = range(12, 19)
-
 
 class OGBench(Environment):
     """Data of OGBench's own oracles; no policy is trained here.
@@ -35,7 +32,14 @@ class OGBench(Environment):
         super().__init__(settings, out, workers=workers)
         self.layout = ready_layout(f"ogbench/{settings.scene}")
         self.predicted = self.layout.positions
-        self.inputs = {name: HAND for name in self.layout.fixed}
+        if settings.robot_inputs not in ("position", "all"):
+            raise ValueError(
+                f"robot_inputs is {settings.robot_inputs!r}, expected 'position' or "
+                "'all'"
+            )
+        if settings.robot_inputs == "position":
+            positions = self.layout.positions
+            self.inputs = {name: positions[name] for name in self.layout.fixed}
 
     def collect(self, *, progress: bool = False) -> None:
         """Collects what is missing of the files, and loads them."""

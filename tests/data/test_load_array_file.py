@@ -10,7 +10,13 @@ import h5py
 import numpy as np
 import pytest
 
-from torchrl_caiac.data import UnreadableFileError, action_bounds, from_arrays
+from torchrl_caiac.augment import export_hdf5, export_npz
+from torchrl_caiac.data import (
+    UnreadableFileError,
+    action_bounds,
+    from_arrays,
+    open_dataset,
+)
 from torchrl_caiac.data.load_array_file import load_array_file
 
 ENDS = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], bool)
@@ -61,6 +67,8 @@ def test_the_result_is_that_of_from_arrays(tmp_path, name):
     assert data["next", "terminated"].sum() == 1
     again = load(tmp_path / name)
     assert (data == again).all()
+    with pytest.raises(FileExistsError, match=r"overwrite=True"):
+        load(write(tmp_path / name, arrays(), rewards=np.zeros(9)))
 
 
 def test_other_names_of_the_ends_are_known(tmp_path, name):
@@ -84,13 +92,26 @@ def test_infos_are_kept_by_name(tmp_path, name, caplog):
     assert action_bounds(file.with_name("rows"))[1].tolist() == [1, 1]
 
 
-def test_groups_become_nested_observations(tmp_path):
+def test_groups_become_nested_observations(tmp_path, name):
     content = arrays()
     states, after = content.pop("observations"), content.pop("next_observations")
     for prefix, array in (("observations", states), ("next_observations", after)):
         content |= {f"{prefix}/arm": array[:, :1], f"{prefix}/cup": array[:, 1:]}
-    data = load(write(tmp_path / "a.hdf5", content))
+    data = load(write(tmp_path / name, content))
     assert np.array_equal(data["next", "observation", "cup"], after[:, 1:])
+
+
+@pytest.mark.parametrize("export", [export_npz, export_hdf5])
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_exported_transitions_are_read_back(tmp_path, export, is_nested):
+    first = expected(tmp_path / "b")
+    if is_nested:
+        first = first.clone()
+        for td in (first, first["next"]):
+            td["achieved_goal"] = td["observation"][:, :1]
+    file = export(first, tmp_path / f"a.{export.__name__.removeprefix('export_')}")
+    again = open_dataset(file, tmp_path / "rows", progress=False)
+    assert (again == first).all()
 
 
 @pytest.mark.parametrize(
@@ -99,8 +120,8 @@ def test_groups_become_nested_observations(tmp_path):
         ({"actions": None}, {}, KeyError, r"a\.\w+ lacks \['actions'\], it has \["),
         ({}, {"infos": ["cup"]}, KeyError, r"lacks \['cup'\]"),
         ({}, {"exclude": ["cup"]}, KeyError, r"lacks \['cup'\]"),
-        ({"terminals": None, "timeouts": None}, {}, ValueError, r"end"),
-        ({"rewards": np.full(9, np.nan)}, {}, ValueError, r"'reward'.*NaN"),
+        ({"terminals": None, "timeouts": None}, {}, ValueError, r"a\.\w+: .* end"),
+        ({"rewards": np.full(9, np.nan)}, {}, ValueError, r"a\.\w+: 'reward'.*NaN"),
     ],
 )
 def test_errors_leave_nothing(tmp_path, name, changes, options, error, message):
@@ -119,6 +140,22 @@ def test_files_cut_short_are_refused(tmp_path, name):
         load(file)
     with pytest.raises(FileNotFoundError, match=r"no file .*other"):
         load(file.with_name("other.npz"))
+
+
+def test_damaged_parts_are_refused(tmp_path):
+    states = np.random.default_rng(0).normal(size=(9, 3))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for key, array in arrays().items():
+            file[key] = array
+        del file["observations"]
+        stored = file.create_dataset("observations", data=states, compression="gzip")
+        place = stored.id.get_chunk_info(0).byte_offset
+    content = bytearray((tmp_path / "a.h5").read_bytes())
+    content[place : place + 20] = bytes(20)
+    (tmp_path / "a.h5").write_bytes(content)
+    with pytest.raises(UnreadableFileError, match=r"a.h5 cannot be read"):
+        load(tmp_path / "a.h5")
+    assert os.listdir(tmp_path) == ["a.h5"]
 
 
 def test_without_h5py_the_package_is_named(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from torchrl_caiac.data import UnreadableFileError, load_robomimic
+from torchrl_caiac.data import UnreadableFileError, action_bounds, load_robomimic
 from torchrl_caiac.data.digests import data_source
 
 LENGTHS = {"demo_0": 5, "demo_2": 4, "demo_10": 3}
@@ -149,6 +149,62 @@ def test_masks_select_demonstrations(file):
 def test_the_environment_is_a_remark(file):
     load(file)
     assert data_source(file.with_name("rows"))["env_name"] == "Lift"
+
+
+CONTROLLER = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "kp": 150}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"controller_configs": CONTROLLER},  # of robosuite 1.4
+        {"controller_configs": {"type": "BASIC", "body_parts": {"right": CONTROLLER}}},
+        {"controller_configs": {"input_max": [1.0] * 6, "input_min": [-1.0] * 6}},
+    ],
+)
+def test_bounds_of_actions_are_those_of_the_controllers(tmp_path, settings):
+    def edit(file):
+        args = {"env_name": "Lift", "type": 1, "env_kwargs": settings}
+        file["data"].attrs["env_args"] = json.dumps(args)
+
+    load(write(tmp_path / "a.hdf5", edit=edit))
+    low, high = action_bounds(tmp_path / "rows")
+    assert low.tolist() == [-1] * 7 and high.tolist() == [1] * 7
+
+
+@pytest.mark.parametrize("change", [None, "limits", "actions", "text"])
+def test_bounds_that_are_not_sure_are_unknown(tmp_path, change, caplog):
+    def edit(file):
+        controllers = {"left": CONTROLLER, "right": CONTROLLER}
+        if change == "limits":
+            controllers["left"] = {"input_max": 0.5, "input_min": -0.5}
+        if change == "actions":
+            file["data/demo_2/actions"][1, 3] = 1.5
+        args = json.dumps({"env_kwargs": {"controller_configs": controllers}})
+        if change is not None:
+            text = args[:10] if change == "text" else args
+            file["data"].attrs["env_args"] = text
+
+    load(write(tmp_path / "a.hdf5", edit=edit))
+    assert action_bounds(tmp_path / "rows") is None
+    said = "but the actions of demo_2 are outside" in caplog.text
+    assert said == (change == "actions")
+
+
+def test_a_last_observation_without_action_is_used(tmp_path, caplog):
+    def edit(file):
+        for name, length in LENGTHS.items():
+            group, parts = file["data"][name], demo(name, length)
+            del group["next_obs"]
+            for key in OBS:
+                del group[f"obs/{key}"]
+                group[f"obs/{key}"] = parts[key]
+
+    with caplog.at_level(logging.INFO, "torchrl_caiac"):
+        data = load(write(tmp_path / "a.hdf5", edit=edit))
+    assert "of each demonstration is left out" not in caplog.text
+    expected = stacked("object", slice(1, None)).astype("f")
+    assert np.array_equal(data["next", "observation", "object"], expected)
 
 
 def libero(file):

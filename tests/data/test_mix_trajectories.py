@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -12,6 +13,8 @@ from tensordict import NonTensorData, TensorDict
 
 from torchrl_caiac.data import (
     action_bounds,
+    from_arrays,
+    from_replay_buffer,
     load_transitions,
     mix_trajectories,
     offline_buffer,
@@ -354,3 +357,68 @@ def test_new_keys_that_would_be_lost_are_refused(name, tmp_path):
         )
     assert (load_transitions(path, verify=True) == old).all()
     assert [entry.name for entry in tmp_path.iterdir()] == ["data"]
+
+
+class TestSourcesOfDifferentLoaders:
+    def sources(self, tmp_path):
+        rng = np.random.default_rng(0)
+        states = {"arm": rng.normal(size=(8, 2)), "cups": {"red": np.ones((8, 1))}}
+        first = from_arrays(
+            states,
+            rng.normal(size=(6, 2)),
+            tmp_path / "arrays",
+            episode_lengths=[2, 4],
+            info={"clock": np.arange(6)},
+            action_bounds=([-9, -9], [9, 9]),
+            progress=False,
+        )
+        second = from_replay_buffer(
+            first.exclude("info"),
+            tmp_path / "buffer",
+            progress=False,
+            action_bounds=([-9, -9], [9, 9]),
+        )
+        return first, second
+
+    def test_what_differs_is_named_and_left_out(self, tmp_path):
+        first, second = self.sources(tmp_path)
+        with pytest.raises(ValueError) as raised:
+            mix_trajectories([first, second])
+        assert "exclude=[('info', 'clock'), ('info', 'episode')]" in str(raised.value)
+        mixed = mix_trajectories(
+            [first, second], exclude=["info"], path=tmp_path / "mixed"
+        )
+        assert len(mixed) == 12
+        assert "info" not in mixed
+        assert action_bounds(mixed) is not None
+        own = mixed[mixed["source"] == 0]
+        order = own["source_episode"].argsort(stable=True)
+        for key in (
+            ("observation", "cups", "red"),
+            ("next", "observation", "arm"),
+            "action",
+        ):
+            assert torch.equal(own[key][order], first[key])
+
+    def test_an_excluded_key_that_nobody_has(self, tmp_path):
+        first, _ = self.sources(tmp_path)
+        with pytest.raises(KeyError, match=r"no source has .*'absent'"):
+            mix_trajectories([first, first], exclude=["absent"])
+
+    def test_other_keys_and_types_of_ids(self, tmp_path):
+        first, _ = self.sources(tmp_path)
+        second = first.clone()
+        second["run"] = second["episode"].int()[:, None] + 5
+        del second["episode"]
+        with pytest.raises(KeyError, match="source 1 lacks the trajectory ids"):
+            mix_trajectories([first, second])
+        with pytest.raises(ValueError, match="list of 1 keys for 2 sources"):
+            mix_trajectories([first, second], trajectory_key=["episode"])
+        mixed = mix_trajectories([first, second], trajectory_key=["episode", "run"])
+        assert "run" not in mixed
+        for number, ids in enumerate([first["episode"], second["run"]]):
+            own = mixed[mixed["source"] == number]
+            assert own["source_episode"].dtype == torch.int64
+            expected = ids.reshape(-1).long()
+            assert own["source_episode"].sort()[0].tolist() == expected.tolist()
+        assert mixed["episode"].unique_consecutive().tolist() == [0, 1, 2, 3]

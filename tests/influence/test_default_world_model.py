@@ -18,6 +18,9 @@ def test_positions_are_predicted_with_the_floor_of_the_layout() -> None:
     assert {n: tuple(c) for n, c in model.config["predict"].items()} == layout.positions
     assert model.entity_floors()["cube0"] == [0.01] * 3  # 1 mm
     assert model.hidden_sizes == (256, 256, 256)
+    inputs = model.config["inputs"]
+    assert inputs["robot"] == [12, 13, 14]
+    assert inputs["cube0"] == list(layout.columns["cube0"])
     plain = default_world_model(EntityLayout({"arm": [0, 1], "cup": [2]}), 2)
     assert plain.predict_dim == plain.input_dim == 3 and plain.auto_floor
 

@@ -196,6 +196,13 @@ def test_zeros_are_a_mode_of_their_own() -> None:
     assert split_scores(binary).confidence == CLEAR
 
 
+@pytest.mark.parametrize(("moving", "confidence"), [(4, UNCLEAR), (5, CLEAR)])
+def test_zeros_need_fewer_moving_rows(moving: int, confidence: str) -> None:
+    scores = np.where(np.arange(400) < moving, 7.0, 0.0)
+    motion = np.where(scores > 0, MOVES, RESTS).astype(np.int8)
+    assert split_scores(scores, motion).confidence == confidence
+
+
 def test_zeros_below_a_spread_are_small_scores() -> None:
     scores, truth = mixture()
     scores[np.flatnonzero(~truth)[:50]] = 0.0

@@ -485,6 +485,20 @@ def test_data_of_the_environment_match(named: tuple[str, Simulator]) -> None:
     assert set(matching) == {n for n in layout_names() if meaning(n) == meaning(name)}
 
 
+@pytest.mark.parametrize(
+    ("task", "count"), [("drawer-open", "one-object"), ("stick-push", "two-objects")]
+)
+@pytest.mark.parametrize("goal", ["observable", "hidden"])
+def test_data_of_metaworld_match(task: str, count: str, goal: str) -> None:
+    import metaworld.env_dict
+
+    tasks = getattr(metaworld.env_dict, f"ALL_V3_ENVIRONMENTS_GOAL_{goal.upper()}")
+    env = tasks[f"{task}-v3-goal-{goal}"](seed=0)
+    rows = torch.as_tensor(episode(env, np.asarray)())
+    found = matching_layouts(TensorDict({"observation": rows}, [len(rows)]))
+    assert found == [f"metaworld/{count}"]
+
+
 def meaning(name: str) -> list[Any]:
     """What tells data of a layout from others."""
     return [replace(c, entity=None, what="") for c in describe_layout(name).columns]

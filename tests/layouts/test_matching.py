@@ -68,6 +68,12 @@ def test_values_that_are_not_finite_do_not_match() -> None:
     assert matching_layouts(as_data("ogbench/scene", value)) == []
 
 
+@pytest.mark.parametrize("name", layout_names())
+def test_zeros_match_nothing(name: str) -> None:
+    zeros = torch.zeros(10, describe_layout(name).width)
+    assert matching_layouts(as_data(name, zeros)) == []
+
+
 def test_goals_of_another_width_do_not_match() -> None:
     data = as_data("fetch/push", observations("fetch/push"))
     assert "fetch/push" in matching_layouts(

@@ -23,6 +23,9 @@ def transitions(episodes: int, length: int, width: int, seed: int = 0) -> Tensor
     """Random walks, without scores."""
     generator = torch.Generator().manual_seed(seed)
     steps = torch.randn(episodes, length + 1, width, generator=generator)
+    # What is not in the first columns rests in three of four steps.
+    moves = torch.rand(episodes, length + 1, 1, generator=generator) < 0.25
+    steps[:, :, 3:] *= moves
     walk = steps.cumsum(1)
     end = torch.zeros(episodes, length, 1, dtype=torch.bool)
     end[:, -1] = True

@@ -75,6 +75,12 @@ def test_what_is_expected_is_not_named() -> None:
     assert share.is_done
 
 
+def test_a_threshold_below_zero_is_meant() -> None:
+    rb = buffer(0.3, 0.01, threshold={"cup": -1.0, "lid": 0.05})
+    (message,) = messages(rb, 30)
+    assert "cup" not in message and "['lid'] in all" in message
+
+
 def test_windows_count_once() -> None:
     transform = CAIACTransform(LAYOUT, score_key="s", window=4, check=False)
     state = torch.zeros(400, 3)

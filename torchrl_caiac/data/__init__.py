@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac.data.action_bounds import action_bounds
+from torchrl_caiac.data.add_leaf import add_leaf
 from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
 from torchrl_caiac.data.digests import verify_digests, write_digests
 from torchrl_caiac.data.episodes import episode_transitions
@@ -28,6 +29,7 @@ __all__ = [
     "TransitionWriter",
     "UnreadableFileError",
     "action_bounds",
+    "add_leaf",
     "collect_episodes",
     "episode_transitions",
     "from_arrays",

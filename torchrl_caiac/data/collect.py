@@ -7,7 +7,9 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, Union
 
@@ -30,6 +32,7 @@ __all__ = [
     "EpisodeArrays",
     "EpisodeSource",
     "collect_episodes",
+    "collection_folder",
     "load_episode",
     "record_episode",
 ]
@@ -191,6 +194,30 @@ def collect_episodes(
         sum(report.failures),
     )
     return report
+
+
+@contextmanager
+def collection_folder(work: str | os.PathLike[str] | None) -> Iterator[Path]:
+    """Context manager that provides a folder for a collection.
+
+    Args:
+        work (path, optional): the folder, to resume an interrupted collection.
+            ``None``: a temporary folder, deleted at the end of the block.
+
+    Yields:
+        Path: the folder.
+
+    Examples:
+        >>> from torchrl_caiac.data.collect import collection_folder
+        >>> with collection_folder("/work/play") as folder:
+        ...     folder.as_posix()
+        '/work/play'
+    """
+    if work is not None:
+        yield Path(work)
+        return
+    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
+        yield Path(folder)
 
 
 def load_episode(

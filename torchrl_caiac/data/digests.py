@@ -24,6 +24,7 @@ __all__ = [
     "file_digest",
     "has_digests",
     "original_leaves",
+    "tensor_bytes",
     "verify_digests",
     "write_digests",
 ]
@@ -135,9 +136,30 @@ def _name(folder: str, leaf: torch.Tensor) -> str | None:
 def _tensor_digest(tensor: torch.Tensor) -> str:
     digest = hashlib.sha256(f"{tensor.dtype}{list(tensor.shape)}".encode())
     for part in tensor.detach().split(1 << 16) if tensor.ndim else (tensor,):
-        flat = part.cpu().contiguous().reshape(-1)
-        digest.update(flat.view(torch.uint8).numpy().tobytes())
+        digest.update(tensor_bytes(part))
     return digest.hexdigest()
+
+
+def tensor_bytes(tensor: torch.Tensor) -> memoryview:
+    """Returns the content of a tensor, as it is in the file of a memory-mapped one.
+
+    Args:
+        tensor (torch.Tensor): ``[*]``.
+
+    Returns:
+        memoryview: the bytes.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.data.digests import tensor_bytes
+        >>> list(tensor_bytes(torch.tensor([1, 2], dtype=torch.int16)))
+        [1, 0, 2, 0]
+    """
+    flat = tensor.detach().cpu().contiguous().reshape(-1)
+    if flat.stride(0) != 1:  # a single number, expanded, counts as contiguous
+        flat = flat.clone(memory_format=torch.contiguous_format)
+    content: memoryview = flat.view(torch.uint8).numpy().data
+    return content
 
 
 def write_digests(

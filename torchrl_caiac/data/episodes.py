@@ -59,7 +59,7 @@ def episode_transitions(
         where (str): the episode's name in error messages, such as
             ``"episode 3 of file.npz"``.
         rewards (array, optional): the rewards after the actions, ``[L]`` or ``[L, 1]``.
-            Defaults to ``None``: the result has no rewards.
+            They become float32. Defaults to ``None``: the result has no rewards.
         next_observations (array or mapping of str to arrays, optional): the states
             after the actions, ``[L, ...]``, with the entries of ``observations``.
             Defaults to ``None``: rows ``1`` to ``L`` of ``observations``.
@@ -124,7 +124,8 @@ def episode_transitions(
     td["action"] = reader.tensors(action)["action"]
     td["next"] = after
     if rewards is not None:
-        reward = reader.column("reward", rewards, length)
+        # In float32 even if they are integers: they are added to values.
+        reward = reader.column("reward", rewards, length).astype(float)
         td["next", "reward"] = reader.tensors({"reward": reward})["reward"]
     for name, flags in (("terminated", terminated), ("truncated", truncated)):
         td["next", name] = reader.flags(name, flags, length)

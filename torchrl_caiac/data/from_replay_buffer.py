@@ -146,6 +146,8 @@ def from_replay_buffer(
         raise ValueError(f"unknown_next is {unknown_next!r}, expected 'drop' or 'keep'")
     data = _rows(source)
     length = len(data) if isinstance(source, TensorDictBase) else len(_storage(source))
+    if not length:
+        raise ValueError("the source is empty: give data with at least one row")
     data, whole = _without(data, exclude), data
     check_entries(data, "the source")
     if trajectory_key is not None and not _has_ids(data, trajectory_key):
@@ -361,7 +363,7 @@ def _transitions(
         td[name] = _plain(rows.get(key))
     if rows.get(keys.reward, None) is not None:
         reward = _one_each(rows.get(keys.reward), keys.reward, where)
-        td["next", "reward"] = _cast(reward)
+        td["next", "reward"] = _plain(reward).float()
     terminated, truncated = _flags(rows, keys.done, where)
     early = (terminated | truncated)[: -1 if ends else None]
     if early.any():

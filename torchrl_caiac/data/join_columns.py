@@ -48,9 +48,10 @@ def join_columns(parts: Mapping[str, Any], where: str) -> NDArray[Any]:
         raise ValueError(
             f"{where} has entries of different lengths, {lengths}: remove the episode"
         )
-    return np.concatenate(
-        [array.reshape(len(array), -1) for array in arrays.values()], axis=1
-    )
+    columns = [
+        array[:, None] if array.ndim == 1 else array for array in arrays.values()
+    ]
+    return np.concatenate(columns, axis=1)
 
 
 def column_ranges(parts: Mapping[str, Any]) -> dict[str, list[int]]:

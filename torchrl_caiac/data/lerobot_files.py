@@ -19,8 +19,8 @@ __all__ = ["LeRobotDescription", "describe_lerobot", "lerobot_episodes"]
 
 _AGAIN = "download or record the dataset again"
 _ROWS = 4096  # that are read at a time
-# Frames of cameras: not numbers, or in other files.
-_CAMERAS = ("image", "video")
+# Frames of cameras, which are not numbers or lie in other files, and texts.
+_NO_NUMBERS = ("image", "string", "video")
 
 
 class LeRobotDescription(NamedTuple):
@@ -31,7 +31,7 @@ class LeRobotDescription(NamedTuple):
         version (str): the version of the format, such as ``"v2.1"``.
         shapes (dict of str to tuple): the shape of one frame of each feature of
             numbers.
-        cameras (list of str): the features that are images or videos.
+        others (list of str): the features that are images, videos or texts.
         tasks (dict of int to str): the texts of the tasks.
         lengths (dict of int to int): the number of frames of each episode.
 
@@ -46,7 +46,7 @@ class LeRobotDescription(NamedTuple):
     root: Path
     version: str
     shapes: dict[str, tuple[int, ...]]
-    cameras: list[str]
+    others: list[str]
     tasks: dict[int, str]
     lengths: dict[int, int]
 
@@ -88,7 +88,7 @@ def describe_lerobot(root: Path) -> LeRobotDescription:
             f"{file} has the codebase_version {version!r}, expected v2.x or v3.x: "
             "convert the dataset with LeRobot"
         )
-    shapes, cameras = _features(info, file)
+    shapes, others = _features(info, file)
     if version.startswith("v2."):
         tasks = _lines(root / "meta" / "tasks.jsonl")
         episodes = _lines(root / "meta" / "episodes.jsonl")
@@ -109,7 +109,7 @@ def describe_lerobot(root: Path) -> LeRobotDescription:
             f"the tasks or episodes in {root / 'meta'} cannot be read ({error!r}): "
             f"{_AGAIN}"
         ) from error
-    return LeRobotDescription(root, version, shapes, cameras, texts, lengths)
+    return LeRobotDescription(root, version, shapes, others, texts, lengths)
 
 
 # pandas names the index of a table so.
@@ -126,13 +126,13 @@ def _task(row: Mapping[str, Any]) -> str:
 def _features(
     info: Mapping[str, Any], file: Path
 ) -> tuple[dict[str, tuple[int, ...]], list[str]]:
-    shapes, cameras = {}, []
+    shapes, others = {}, []
     try:
         for name, feature in info["features"].items():
             dtype, shape = feature["dtype"], feature["shape"]
-            if dtype in _CAMERAS:
-                cameras.append(name)
-            elif dtype != "string":
+            if dtype in _NO_NUMBERS:
+                others.append(name)
+            else:
                 if not all(type(size) is int and size >= 0 for size in shape):
                     raise ValueError(f"the shape of {name!r} is {shape!r}")
                 shapes[name] = tuple(shape) or (1,)
@@ -140,7 +140,7 @@ def _features(
         raise UnreadableFileError(
             f"{file} has unreadable features ({error!r}): {_AGAIN}"
         ) from error
-    return shapes, cameras
+    return shapes, others
 
 
 def _lines(file: Path) -> list[dict[str, Any]]:

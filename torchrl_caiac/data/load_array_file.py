@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac.data.from_arrays import from_arrays
+from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
 from torchrl_caiac.data.minari_checks import check_hdf5_group
 from torchrl_caiac.data.npz_streams import NpzStreams
 
@@ -37,7 +38,9 @@ _ARGUMENTS = {
         "desired_goals",
         "next_achieved_goals",
     )
-} | {"terminations": "terminals", "truncations": "timeouts"}
+}
+_ARGUMENTS |= {"terminations": "terminals", "truncations": "timeouts"}
+_ARGUMENTS |= {"episodes": "episode_ids"}
 
 
 def load_array_file(
@@ -55,9 +58,11 @@ def load_array_file(
     The names of the arrays are those of the arguments of
     :func:`~torchrl_caiac.data.from_arrays`, as in files of D4RL: ``observations`` and
     ``actions`` are needed, and so are ``terminals``, ``timeouts``, ``episode_ids`` or
-    ``episode_lengths``, which say where episodes end. ``terminations`` and
-    ``truncations`` are read as ``terminals`` and ``timeouts``. In HDF5 files,
-    ``observations`` may be a group, which becomes a nested observation.
+    ``episode_lengths``, which say where episodes end. ``terminations``,
+    ``truncations`` and ``episodes`` are read as ``terminals``, ``timeouts`` and
+    ``episode_ids``. A group ``observations``, or arrays ``observations/<name>`` in an
+    ``.npz`` file, become a nested observation. These are also the files that
+    :mod:`torchrl_caiac.augment` writes.
 
     Args:
         file (str or Path): the file, ``.npz`` or HDF5.
@@ -130,51 +135,83 @@ def load_array_file(
                 "%s of %s are left out; pass infos= to keep some", left_out, file
             )
         kept = {argument: arrays[name] for name, argument in used.items()}
-        return from_arrays(
-            kept.pop("observations"),
-            kept.pop("actions"),
-            path,
-            **kept,
-            info={name: arrays[name] for name in infos} or None,
-            action_bounds=action_bounds,
-            overwrite=overwrite,
-            progress=progress,
-        )
+        try:
+            return from_arrays(
+                kept.pop("observations"),
+                kept.pop("actions"),
+                path,
+                **kept,
+                info={name: arrays[name] for name in infos} or None,
+                action_bounds=action_bounds,
+                overwrite=overwrite,
+                progress=progress,
+            )
+        except UnreadableFileError:
+            raise
+        except (TypeError, ValueError) as error:
+            # These name the arrays alone.
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(f"{file}: {error}") from error
+        except OSError as error:
+            # h5py's has no number: a part cannot be decompressed.
+            if type(error) is not OSError or error.errno is not None:
+                raise
+            raise UnreadableFileError(
+                f"{file} cannot be read, it may be damaged ({error}): {_AGAIN}"
+            ) from error
 
 
 def _arrays(file: Path, stack: ExitStack) -> Mapping[str, Any]:
     """Returns the arrays of a file, or what reads them in parts."""
     if file.suffix == ".npz":
         streams = stack.enter_context(NpzStreams(file, "file of arrays", _AGAIN))
-        return {
-            name: streams.take(name, kind.shape[0])
-            for name, kind in streams.kinds.items()
-            if kind.shape
-        }
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(
-            f"{file} needs the package h5py: install it with "
-            "pip install 'torchrl-caiac[robomimic]'"
-        ) from error
-    try:
-        stored = stack.enter_context(h5py.File(file, "r"))
+        return _Archive(streams)
+    stored = stack.enter_context(open_hdf5(file))
+    with reading_hdf5(file):
         check_hdf5_group(stored, file)
-    except (OSError, RuntimeError, ValueError) as error:
-        if isinstance(error, UnreadableFileError):
-            raise
-        raise UnreadableFileError(
-            f"{file} is not a readable HDF5 file, it may be truncated or damaged "
-            f"({error}): {_AGAIN}"
-        ) from error
-    found: dict[str, Any] = {}
-    for name, item in stored.items():
-        if not isinstance(item, h5py.Group) or name in _ARGUMENTS:
-            found[name] = _tree(item)
-        else:
-            found |= {f"{name}/{inner}": _tree(item[inner]) for inner in item}
-    return found
+        found: dict[str, Any] = {}
+        for name, item in stored.items():
+            if hasattr(item, "keys") and name not in _ARGUMENTS:
+                found |= {f"{name}/{inner}": _tree(item[inner]) for inner in item}
+            else:
+                found[name] = _tree(item)
+        return found
+
+
+class _Archive(Mapping[str, Any]):
+    """The arrays of an archive, read when they are asked for."""
+
+    def __init__(self, streams: NpzStreams) -> None:
+        self._streams = streams
+        # The arrays of a name: one, or those of a group.
+        self._parts: dict[str, list[str]] = {}
+        for name, kind in streams.kinds.items():
+            group = name.split("/")[0]
+            if kind.shape:
+                whole = group if group in _ARGUMENTS else name
+                self._parts.setdefault(whole, []).append(name)
+
+    def __getitem__(self, name: str) -> Any:
+        tree: dict[str, Any] = {}
+        for part in self._parts[name]:
+            array = self._streams.take(part, self._streams.kinds[part].shape[0])
+            if part == name:
+                return array
+            *above, last = part.split("/")[1:]
+            inner = tree
+            for group in above:
+                inner = inner.setdefault(group, {})
+            inner[last] = array
+        return tree
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._parts
 
 
 def _tree(item: Any) -> Any:

@@ -76,8 +76,8 @@ def load_lerobot(
     The features ``observation.*`` are the leaves of a nested observation:
     ``observation.state`` becomes ``("observation", "state")``. With ``keys``, they are
     joined to one flat ``"observation"``. The columns of each are then logged, and
-    stored as ``"columns"`` of :func:`~torchrl_caiac.data.digests.data_source`. Images
-    and videos are left out.
+    stored as ``"columns"`` of :func:`~torchrl_caiac.data.digests.data_source`. Images,
+    videos and texts are left out.
 
     LeRobot stores no next observation. The last frame of an episode has an action that
     leads nowhere: its row is left out, with its reward and its ``next.done``. Hence the
@@ -250,7 +250,7 @@ def _names(
         raise ValueError(f"keys={list(keys)} names a feature twice: name it once")
     asked = {"keys": keys or (), "action": (action,), "infos": infos}
     for option, wanted in {**asked, "exclude": exclude}.items():
-        known = {*there, *description.cameras} if option == "exclude" else there
+        known = {*there, *description.others} if option == "exclude" else there
         missing = [name for name in wanted if name not in known]
         if missing:
             raise KeyError(
@@ -301,7 +301,7 @@ def _announce(
     )
     read = {*names.all(), *exclude, *_POSITIONS}
     unread = [name for name in description.shapes if name not in read]
-    left_out = [*description.cameras, *unread]
+    left_out = [*description.others, *unread]
     if left_out:
         _logger.info("the features %s are left out", left_out)
     if not names.is_flat:

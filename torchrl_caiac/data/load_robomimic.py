@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,18 +11,21 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from tensordict import TensorDict
 
-from torchrl_caiac._files import UnreadableFileError
 from torchrl_caiac.data.digests import file_digest
 from torchrl_caiac.data.episodes import episode_transitions
+from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
 from torchrl_caiac.data.join_columns import column_ranges, join_columns
 from torchrl_caiac.data.minari_checks import check_hdf5_group
+from torchrl_caiac.data.robomimic_settings import (
+    controller_bounds,
+    environment_settings,
+)
 from torchrl_caiac.data.write_episodes import Part, write_episodes
 
 __all__ = ["load_robomimic"]
 
 _logger = logging.getLogger("torchrl_caiac.data.load_robomimic")
 
-_AGAIN = "download or collect the dataset again"
 # LIBERO writes this attribute, and the observation *after* each action.
 _LIBERO = "bddl_file_name"
 
@@ -60,8 +62,9 @@ def load_robomimic(
     ``"observation"``. The columns of each are then logged, and stored as ``"columns"``
     of :func:`~torchrl_caiac.data.digests.data_source`.
 
-    The next observations are those of ``next_obs``. Without them, the last action of
-    each demonstration has no next observation, and its row is left out.
+    The next observations are those of ``next_obs``. Without them, and without one
+    observation more than actions, the last action of each demonstration has no next
+    observation, and its row is left out.
 
     A demonstration ends when the recording does, also after a success: robosuite's
     environments go on. Hence its last row counts as truncated. ``dones`` are kept with
@@ -93,9 +96,9 @@ def load_robomimic(
             ``"after"`` for files with the attribute ``bddl_file_name``, which LIBERO
             writes so, else ``"before"``, as robomimic writes them.
         action_bounds (tuple of sequences, optional): the lowest and the highest action,
-            see :func:`~torchrl_caiac.data.action_bounds`. Those of robosuite's
-            controllers are usually -1 and 1; the file does not say so. Defaults to
-            ``None``: unknown.
+            see :func:`~torchrl_caiac.data.action_bounds`. Defaults to ``None``: -1 and
+            1 if the attribute ``env_args`` says that robosuite's controllers take
+            inputs from -1 to 1, and all actions are; else unknown.
         overwrite (bool): whether to replace ``path`` if it exists. Defaults to
             ``False``.
         progress (bool): whether to show a progress bar over the demonstrations.
@@ -142,7 +145,6 @@ def load_robomimic(
         torch.Size([6, 13])
         >>> folder.cleanup()
     """
-    h5py = _h5py()
     if observed not in (None, "before", "after"):
         raise ValueError(
             f"observed is {observed!r}, expected 'before', 'after' or None"
@@ -155,30 +157,35 @@ def load_robomimic(
             "at least one, and images= and exclude= do not apply: leave these out"
         )
     file = Path(file)
-    with _opened(h5py, file) as stored:
-        demos = _demos(stored, file, mask)
-        is_after = observed == "after" or (
-            observed is None and _LIBERO in stored["data"].attrs
-        )
-        options = _Options(
-            None if keys is None else tuple(keys),
-            tuple(images),
-            tuple(infos),
-            tuple(exclude),
-            is_after,
-        )
-        columns = _announce(stored["data"][demos[0]], f"{demos[0]} of {file}", options)
+    with open_hdf5(file) as stored:
+        with reading_hdf5(file):
+            data = stored.get("data")
+            demos = _demos(stored, file, mask)
+            is_after = observed == "after" or (
+                observed is None and _LIBERO in data.attrs
+            )
+            options = _Options(
+                None if keys is None else tuple(keys),
+                tuple(images),
+                tuple(infos),
+                tuple(exclude),
+                is_after,
+            )
+            columns = _announce(data[demos[0]], f"{demos[0]} of {file}", options)
+            settings = environment_settings(data)
+            if action_bounds is None:
+                action_bounds = controller_bounds(data, demos, file)
         source = {
             "format": "robomimic",
             "dataset": file.name,
             "sha256": file_digest(file),
-            "env_name": _env_name(stored["data"]),
+            "env_name": settings.get("env_name"),
             "mask": mask,
             "columns": columns,
             **{name: value for name, value in options._asdict().items() if value},
         }
         return write_episodes(
-            _parts(stored["data"], demos, file, options),
+            _parts(data, demos, file, options),
             path,
             source=source,
             action_bounds=action_bounds,
@@ -194,30 +201,9 @@ def _parts(
 ) -> Iterator[Part]:
     for name in demos:
         where = f"{name} of {file}"
-        yield Part(_transitions(data[name], file, where, options), where)
-
-
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(
-            "robomimic datasets need the package h5py: install it with "
-            "pip install 'torchrl-caiac[robomimic]'"
-        ) from error
-    return h5py
-
-
-def _opened(h5py: Any, file: Path) -> Any:
-    if not file.exists():
-        raise FileNotFoundError(f"there is no file {file}: give another one")
-    try:
-        return h5py.File(file, "r")
-    except OSError as error:
-        raise UnreadableFileError(
-            f"{file} is not a readable HDF5 file, it may be truncated or damaged "
-            f"({error}): {_AGAIN}"
-        ) from error
+        with reading_hdf5(file):
+            demo = data[name]
+        yield Part(_transitions(demo, file, where, options), where)
 
 
 def _demos(stored: Any, file: Path, mask: str | None) -> list[str]:
@@ -250,19 +236,12 @@ def _demos(stored: Any, file: Path, mask: str | None) -> list[str]:
     return sorted(set(names), key=lambda name: int(name.removeprefix("demo_")))
 
 
-def _env_name(data: Any) -> str | None:
-    """Returns the name of the environment, if the file has it."""
-    try:
-        name = json.loads(data.attrs["env_args"])["env_name"]
-    except (KeyError, TypeError, ValueError):  # it is only a remark
-        return None
-    return name if isinstance(name, str) else None
-
-
 def _announce(demo: Any, where: str, options: _Options) -> dict[str, list[int]] | None:
     """Logs what is left out or joined, and returns the columns of what is joined."""
     observations = _group(demo, "obs", where)
-    if "next_obs" not in demo:
+    seen = [item for item in observations.values() if getattr(item, "shape", None)]
+    rows = {len(item) for item in seen} - {len(demo.get("actions", ())) + 1}
+    if "next_obs" not in demo and rows:
         _logger.info(
             "%s has no next_obs: the %s row of each demonstration is left out, because "
             "its action has no %sobservation",
@@ -328,7 +307,7 @@ def _selected(observations: Any, options: _Options, where: str) -> dict[str, Any
 
 
 def _transitions(demo: Any, file: Path, where: str, options: _Options) -> TensorDict:
-    try:
+    with reading_hdf5(file):
         check_hdf5_group(demo, file)
         states = _states(_group(demo, "obs", where), options, where)
         has_next = "next_obs" in demo
@@ -343,23 +322,18 @@ def _transitions(demo: Any, file: Path, where: str, options: _Options) -> Tensor
                     f"{where} has no {name!r}, it has {sorted(demo)}: correct the file"
                     f"{' or infos=' if name in options.infos else ''}"
                 )
-        actions = demo["actions"][()]
+        actions = _read(demo["actions"])
         # LIBERO stores them as uint8.
         rewards = demo["rewards"][()].astype(float) if "rewards" in demo else None
         infos = {name: _read(demo[name]) for name in options.infos}
-    except (OSError, RuntimeError, ValueError) as error:
-        if isinstance(error, UnreadableFileError) or where in str(error):
-            raise
-        raise UnreadableFileError(
-            f"{where} cannot be read ({error}): {_AGAIN}"
-        ) from error
     if has_next and options.is_after:
         raise ValueError(
             f"{where} has next_obs, so its observations are those before the actions: "
             "leave out observed="
         )
-    if not has_next:
-        length = _rows(states)
+    length = _rows(states)
+    # One state more than actions is the last one, as in episode_transitions.
+    if not has_next and length != len(actions) + 1:
         if len(actions) != length:
             raise ValueError(
                 f"{where} has {len(actions)} actions and {length} observations, "

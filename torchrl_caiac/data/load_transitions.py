@@ -38,9 +38,10 @@ def load_transitions(
     ``TensorDict.load_memmap`` fills the missing part of a truncated file with zeros, in
     the data and on disk. This function checks the size of every file first, and reads
     nothing but tensors. The returned tensordict is flagged as memory-mapped, so that
-    leaves can be added to it. If a process was killed while it added one, or while it
-    replaced the folder, the folder is restored to what it was before. While another
-    process replaces it, it is missing for a moment.
+    :func:`~torchrl_caiac.data.add_leaf` can add leaves to it and to the folder. If a
+    process was killed while it added one, or while it replaced the folder, the folder
+    is restored to what it was before. While another process replaces it, it is missing
+    for a moment.
 
     Args:
         path (str or Path): the folder, as written by

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchrl_caiac._files import UnreadableFileError, whole_folder
+from torchrl_caiac.data.collect import collection_folder
 from torchrl_caiac.data.minari_checks import check_metadata
 
 if TYPE_CHECKING:
@@ -170,11 +171,9 @@ def work_folder(work: str | os.PathLike[str] | None, dataset_id: str) -> Iterato
         ...     folder.as_posix()
         '/work/push-play-v0'
     """
-    if work is not None:
-        yield Path(work) / dataset_id.replace("/", "-")
-        return
-    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
-        yield Path(folder)
+    own = None if work is None else Path(work) / dataset_id.replace("/", "-")
+    with collection_folder(own) as folder:
+        yield folder
 
 
 def publish_dataset(
@@ -257,7 +256,9 @@ def publish_dataset(
             partial = made.parent / "minari"
             partial.mkdir()
             bar = tqdm(buffers, desc=f"writing {dataset_id}", disable=not progress)
-            with _datasets_in(partial):
+            with _datasets_in(partial), warnings.catch_warnings():
+                if env is None:  # which is what it warns of
+                    warnings.filterwarnings("ignore", module="minari")
                 minari.create_dataset_from_buffers(
                     dataset_id,
                     bar,

@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._files import reserve
-from torchrl_caiac._keys import get_leaf
+from torchrl_caiac._keys import as_key, get_leaf
 from torchrl_caiac._keys import path as key_path
 from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.data.action_bounds import action_bounds, write_action_bounds
@@ -40,7 +40,8 @@ def mix_trajectories(
     trajectories: int | None = None,
     seed: int = 0,
     path: str | Path | None = None,
-    trajectory_key: NestedKey = "episode",
+    trajectory_key: NestedKey | list[NestedKey] = "episode",
+    exclude: Sequence[NestedKey] = (),
     done_key: NestedKey | None = ("next", "done"),
     source_key: NestedKey = "source",
     source_trajectory_key: NestedKey = "source_episode",
@@ -69,8 +70,10 @@ def mix_trajectories(
 
     Args:
         sources (sequence of TensorDictBase): transitions ``[T]``, in memory or
-            memory-mapped, with the same keys, dtypes and shapes after ``T``. For the
-            trajectories see :func:`~torchrl_caiac.trajectories.trajectory_index`.
+            memory-mapped, as from any of the loaders, with the same keys, dtypes and
+            shapes after ``T``, except for the trajectory ids and what ``exclude``
+            names. For the trajectories see
+            :func:`~torchrl_caiac.trajectories.trajectory_index`.
 
     Keyword Args:
         shares (sequence of float, optional): the share of each source in the
@@ -83,8 +86,11 @@ def mix_trajectories(
         seed (int): the seed of the draw. Defaults to ``0``.
         path (str or Path, optional): the folder of a memory-mapped result. It is
             written leaf by leaf and atomically. Defaults to ``None``: in memory.
-        trajectory_key (NestedKey): the key of the trajectory ids, ``[T]`` or
-            ``[T, 1]``. Defaults to ``"episode"``.
+        trajectory_key (NestedKey or list of NestedKey): the key of the trajectory ids,
+            ``[T]`` or ``[T, 1]``; a list has one for each source, and the mixture has
+            the first one. Defaults to ``"episode"``.
+        exclude (sequence of NestedKey): entries to leave out of all sources that have
+            them, such as ``("info", "qpos")`` or ``"caiac"``. Defaults to ``()``.
         done_key (NestedKey, optional): the end flags, which end a trajectory too where
             the data have them; ``None`` to use the ids alone. Defaults to
             ``("next", "done")``.
@@ -98,7 +104,7 @@ def mix_trajectories(
 
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
-        KeyError: a source lacks ``trajectory_key``.
+        KeyError: a source lacks ``trajectory_key``, or all lack one of ``exclude``.
         OSError: the disk is full.
         ValueError: the sources have different leaves or none; ``shares``, ``fraction``
             or ``trajectories`` are out of range or need more trajectories than the
@@ -118,10 +124,14 @@ def mix_trajectories(
         (100, tensor(0.3000))
     """
     check_free(path, overwrite)
-    _check_sources(sources, (source_key, source_trajectory_key))
+    id_keys = _id_keys(trajectory_key, sources)
+    leaves = _check_sources(
+        sources, (source_key, source_trajectory_key), id_keys, exclude
+    )
+    trajectory_key = id_keys[0]
     indices = [
-        _index(source, trajectory_key, done_key, number)
-        for number, source in enumerate(sources)
+        _index(source, key, done_key, number)
+        for number, (source, key) in enumerate(zip(sources, id_keys, strict=True))
     ]
     picks = _draw_trajectories(
         [len(index.ends) for index in indices], shares, fraction, trajectories, seed
@@ -134,22 +144,23 @@ def mix_trajectories(
         np.bincount(picks[:, 0], minlength=len(sources)).tolist(),
     )
     # One row of the result, expanded to allocate all of them.
-    one = sources[0][:1].clone()
+    one = sources[0].select(*leaves, trajectory_key)[:1].clone()
     ids = one.get(trajectory_key)
-    one.set(source_trajectory_key, ids.clone())
+    one.set(source_trajectory_key, _common_ids(sources, id_keys)[:1])
     one.set(trajectory_key, ids.long())
     one.set(source_key, torch.zeros(1, dtype=torch.long, device=ids.device))
     check_entries(one, "the mixture")  # the new keys too
     total = len(rows.number)
     keys = (trajectory_key, source_key, source_trajectory_key)
+    fill = (sources, rows, leaves, id_keys)
     if path is None:
         mixed = one.expand(total).apply(torch.empty_like)
-        _fill(mixed, sources, rows, *keys)
+        _fill(mixed, *fill, *keys)
         return mixed
     with whole_transitions(path, keys=keys) as folder:
         stored = one.cpu().expand(total).memmap_like(folder)
         reserve(folder)
-        _fill(stored, sources, rows, *keys)
+        _fill(stored, *fill, *keys)
         _write_origin(folder, sources)
     return load_transitions(path, keys=keys)
 
@@ -267,6 +278,8 @@ def _fill(
     mixed: TensorDictBase,
     sources: Sequence[TensorDictBase],
     rows: _Rows,
+    leaves: Sequence[NestedKey],
+    id_keys: Sequence[NestedKey],
     trajectory_key: NestedKey,
     source_key: NestedKey,
     source_trajectory_key: NestedKey,
@@ -274,16 +287,38 @@ def _fill(
     shape = mixed.get(trajectory_key).shape
     mixed.get(trajectory_key).copy_(rows.number.view(shape))
     mixed.get(source_key).copy_(rows.source)
-    keys = sources[0].keys(include_nested=True, leaves_only=True)
-    for number, source in enumerate(sources):
+    for number, (source, id_key) in enumerate(zip(sources, id_keys, strict=True)):
         places = (rows.source == number).nonzero().squeeze(1)
         taken = rows.row[places]
-        for key in keys:
-            is_id = key_path(key) == key_path(trajectory_key)
-            leaf = source.get(key)
-            target = mixed.get(source_trajectory_key if is_id else key)
-            values = leaf[taken.to(leaf.device)].to(target.device)
+        pairs = [(key, key) for key in leaves] + [(id_key, source_trajectory_key)]
+        for key, target_key in pairs:
+            leaf, target = source.get(key), mixed.get(target_key)
+            values = leaf[taken.to(leaf.device)].to(target.device, target.dtype)
+            values = values.reshape(len(values), *target.shape[1:])
             target[places.to(target.device)] = values
+
+
+def _common_ids(
+    sources: Sequence[TensorDictBase], keys: Sequence[NestedKey]
+) -> torch.Tensor:
+    """Returns ids in the type and shape that those of all sources fit in."""
+    ids = [source.get(key) for source, key in zip(sources, keys, strict=True)]
+    kinds = {(leaf.dtype, leaf.shape[1:]) for leaf in ids}
+    first = ids[0][:1].clone()
+    return first if len(kinds) == 1 else first.reshape(1).long()
+
+
+def _id_keys(
+    given: NestedKey | list[NestedKey], sources: Sequence[TensorDictBase]
+) -> list[NestedKey]:
+    if not isinstance(given, list):
+        return [given] * len(sources)
+    if len(given) != len(sources):
+        raise ValueError(
+            f"trajectory_key is a list of {len(given)} keys for {len(sources)} "
+            "sources: give one key, or one for each source"
+        )
+    return given
 
 
 def _index(
@@ -292,12 +327,6 @@ def _index(
     done_key: NestedKey | None,
     number: int,
 ) -> TrajectoryIndex:
-    get_leaf(
-        source,
-        trajectory_key,
-        f"source {number} lacks the trajectory ids",
-        "pass trajectory_key=",
-    )
     try:
         return trajectory_index(
             source, trajectory_key=trajectory_key, done_key=done_key
@@ -306,47 +335,73 @@ def _index(
         raise ValueError(f"source {number}: {error}") from error
 
 
-def _check_sources(sources: Sequence[TensorDictBase], new: Sequence[NestedKey]) -> None:
+def _check_sources(
+    sources: Sequence[TensorDictBase],
+    new: Sequence[NestedKey],
+    id_keys: Sequence[NestedKey],
+    exclude: Sequence[NestedKey],
+) -> list[NestedKey]:
+    """Returns the keys of the leaves that all sources have, but for the ids."""
     if isinstance(sources, TensorDictBase) or not len(sources):
         raise ValueError(
             f"sources must be a sequence of at least one tensordict, got "
             f"{type(sources).__name__} of length {len(sources)}"
         )
-    expected = _structure(sources[0], 0)
     for number, source in enumerate(sources):
         if source.batch_dims != 1 or not len(source):
             raise ValueError(
                 f"source {number} has batch size {list(source.batch_size)}, expected "
                 "[T] with at least one row"
             )
-        found = _structure(source, number)
+        get_leaf(
+            source,
+            id_keys[number],
+            f"source {number} lacks the trajectory ids",
+            "pass trajectory_key=, a list if the sources have different keys",
+        )
+    left_out = [key_path(as_key(key)) for key in exclude]
+    for key in left_out:
+        if all(source.get(key, None) is None for source in sources):
+            raise KeyError(f"no source has {key}, which exclude names: correct it")
+    structures = [
+        _structure(source, number, {key_path(as_key(id_key)), *left_out})
+        for number, (source, id_key) in enumerate(zip(sources, id_keys, strict=True))
+    ]
+    expected = structures[0]
+    for number, (source, found) in enumerate(zip(sources, structures, strict=True)):
         lacking = sorted(set(expected) ^ set(found))
         if lacking:
+            names = [key[0] if len(key) == 1 else key for key in lacking]
             raise ValueError(
-                f"only one of source 0 and source {number} has {lacking}: remove them "
-                "with exclude(), or add them"
+                f"only one of source 0 and source {number} has {lacking}: leave them "
+                f"out with exclude={names}, or add them with add_leaf"
             )
         differ = {key: (expected[key], found[key]) for key in expected}
         differ = {key: pair for key, pair in differ.items() if pair[0] != pair[1]}
         if differ:
+            names = [key[0] if len(key) == 1 else key for key in differ]
             raise ValueError(
                 f"leaves of source 0 and source {number} differ in dtype or in the "
-                f"shape after the batch dimension: {differ}; convert them"
+                f"shape after the batch dimension: {differ}; convert them, or leave "
+                f"them out with exclude={names}"
             )
         for key in new:
-            if source.get(key, None) is not None:
+            taken = source.get(key, None) is not None
+            if taken and key_path(as_key(key)) not in left_out:
                 raise ValueError(
                     f"source {number} already has {key!r}, which the mixture would "
-                    "overwrite: rename it, or pass source_key= and "
-                    "source_trajectory_key="
+                    "overwrite: rename it, leave it out with exclude=, or pass "
+                    "source_key= and source_trajectory_key="
                 )
+    return [key[0] if len(key) == 1 else key for key in expected]
 
 
 def _structure(
-    rows: TensorDictBase, number: int
+    rows: TensorDictBase, number: int, left_out: set[tuple[str, ...]]
 ) -> dict[tuple[str, ...], tuple[torch.dtype, tuple[int, ...]]]:
-    check_entries(rows, f"source {number}")
+    kept = rows.exclude(*left_out)
+    check_entries(kept, f"source {number}")
     return {
         key_path(key): (leaf.dtype, tuple(leaf.shape[1:]))
-        for key, leaf in rows.items(include_nested=True, leaves_only=True)
+        for key, leaf in kept.items(include_nested=True, leaves_only=True)
     }

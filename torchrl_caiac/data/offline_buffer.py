@@ -8,6 +8,8 @@ from tensordict import TensorDictBase
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 
+from torchrl_caiac.data.add_leaf import store_leaves
+
 __all__ = ["offline_buffer"]
 
 
@@ -21,7 +23,8 @@ def offline_buffer(
 
     The buffer cannot be extended. Scores written by
     :func:`~torchrl_caiac.influence.score_buffer` become leaves of ``data``, in its
-    folder if it is memory-mapped.
+    folder if it is memory-mapped. Leaves that were set after ``data.unlock_()`` are
+    written to the folder first, see :func:`~torchrl_caiac.data.add_leaf`.
 
     Args:
         data (TensorDictBase): the transitions, ``[T]``, in memory, memory-mapped (see
@@ -54,6 +57,7 @@ def offline_buffer(
             f"data has batch size {list(data.batch_size)}, expected [T] with at least "
             "one row: flatten trajectories, and add trajectory ids"
         )
+    store_leaves(data)
     # Sample on the device of the data, to avoid transfers.
     device = data.device or next(iter(data.values(True, True))).device
     arguments: dict[str, Any] = {

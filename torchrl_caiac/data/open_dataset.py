@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from tensordict import TensorDict
 
-from torchrl_caiac._files import UnreadableFileError
+from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
 from torchrl_caiac.data.load_array_file import load_array_file
 from torchrl_caiac.data.load_lerobot import load_lerobot
 from torchrl_caiac.data.load_minari import load_minari
@@ -73,15 +73,20 @@ def open_dataset(
 ) -> TensorDict:
     """Converts a dataset of any known format to transitions, and opens them.
 
-    | source | format | loader |
-    |---|---|---|
-    | a folder of transitions | ``transitions`` | opened where it is |
-    | a Minari id, ``minari://ID``, or its folder | ``minari`` | ``load_minari`` |
-    | a LeRobot folder, or ``lerobot://REPO`` | ``lerobot`` | ``load_lerobot`` |
-    | OGBench's ``.npz``, or ``ogbench://NAME`` | ``ogbench`` | ``load_ogbench`` |
-    | another ``.npz`` with arrays | ``npz`` | ``from_arrays`` |
-    | HDF5 with ``data/demo_*`` | ``robomimic`` | ``load_robomimic`` |
-    | another HDF5 with arrays, as D4RL's | ``hdf5`` | ``from_arrays`` |
+    The formats, and what reads them:
+
+    - ``transitions``: a folder of transitions, which is opened where it is;
+    - ``minari``: the id of a Minari dataset on this machine, ``minari://ID``, or its
+      folder: :func:`~torchrl_caiac.data.load_minari`;
+    - ``lerobot``: a LeRobot folder, or ``lerobot://REPO``:
+      :func:`~torchrl_caiac.data.load_lerobot`;
+    - ``ogbench``: OGBench's ``.npz``, or ``ogbench://NAME``:
+      :func:`~torchrl_caiac.data.load_ogbench`;
+    - ``npz``: another ``.npz`` with arrays named as the arguments of
+      :func:`~torchrl_caiac.data.from_arrays`;
+    - ``robomimic``: HDF5 with ``data/demo_*``:
+      :func:`~torchrl_caiac.data.load_robomimic`;
+    - ``hdf5``: another HDF5 with such arrays, as those of D4RL.
 
     Names with ``://`` are downloaded if they are not on this machine.
 
@@ -227,7 +232,8 @@ def _names_in_npz(path: Path) -> set[str]:
     if path.suffix != ".npz":
         return set()
     with NpzStreams(path, "file of arrays", _AGAIN) as arrays:
-        return set(arrays.kinds)
+        # Arrays of a group are named "observations/arm".
+        return {name.split("/")[0] for name in arrays.kinds}
 
 
 def _is_ogbench(path: Path) -> bool:
@@ -240,21 +246,8 @@ def _is_ogbench(path: Path) -> bool:
 def _names_in_hdf5(path: Path) -> set[str]:
     if path.suffix not in _HDF5:
         return set()
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(
-            f"{path} needs the package h5py: install it with "
-            "pip install 'torchrl-caiac[robomimic]'"
-        ) from error
-    try:
-        with h5py.File(path, "r") as stored:
-            return set(stored)
-    except (OSError, RuntimeError) as error:
-        raise UnreadableFileError(
-            f"{path} is not a readable HDF5 file, it may be truncated or damaged "
-            f"({error}): {_AGAIN}"
-        ) from error
+    with open_hdf5(path) as stored, reading_hdf5(path):
+        return {str(name) for name in stored}
 
 
 def _is_arrays(names: set[str]) -> bool:

@@ -20,7 +20,7 @@ from torchrl_caiac._keys import leaf_names
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac._torchrl import file_name
 from torchrl_caiac.data.action_bounds import check_action_bounds, write_action_bounds
-from torchrl_caiac.data.digests import write_digests
+from torchrl_caiac.data.digests import tensor_bytes, write_digests
 from torchrl_caiac.data.write_transitions import (
     check_bounds_fit,
     check_entries,
@@ -167,12 +167,13 @@ class TransitionWriter:
             )
         self._check(episode, where, ends)
         ids = torch.full((len(episode),), self.episodes)
-        rows = episode.detach().cpu().exclude().set("episode", ids)
+        rows = episode.copy().set("episode", ids)  # without a copy of the leaves
         if self._first is None:
             check_entries(rows, where)
             if self._bounds is not None:
                 check_bounds_fit(rows, self._bounds)
-            self._first, self._first_name = rows[:1].clone(), where
+            first = rows[:1].detach().cpu().clone()
+            self._first, self._first_name = first, where
             self._kinds = _kinds(rows)
             self._open_files(self._folder)
         self._check_kinds(_kinds(rows), where)
@@ -261,7 +262,7 @@ class TransitionWriter:
 
     def _write(self, key: _Key, leaf: torch.Tensor) -> None:
         file = self._files[key]
-        content = leaf.contiguous().reshape(-1).view(torch.uint8).numpy().data
+        content = tensor_bytes(leaf)
         try:
             file.write(content)
             file.flush()

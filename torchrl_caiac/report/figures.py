@@ -23,6 +23,7 @@ from torchrl_caiac.report.swaps import Cells, PairCoverage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.path import Path
     from numpy.typing import NDArray
 
 __all__ = [
@@ -193,6 +194,8 @@ def draw_coverage(pair: PairCoverage, *, name: str, description: str) -> str:
     Returns:
         str: the ``<svg>`` element.
     """
+    from matplotlib.patches import PathPatch
+
     before, after = pair.before.numpy(), pair.after.numpy()
     with drawing():
         figure = new_figure(_NARROW, 3.1)
@@ -208,18 +211,10 @@ def draw_coverage(pair: PairCoverage, *, name: str, description: str) -> str:
             before, after = (x.compress(visited, 1 - side) for x in (before, after))
             edges.append(np.arange(int(visited.sum()) + 1.0))
         x, y = edges
-        # The first entity is on the horizontal axis: a row of cells is a column here.
         for cells, colour in ((before, RECORDED), (after & ~before, ADDED)):
-            for j in range(cells.shape[1]):
-                bars = [(x[a], x[b] - x[a]) for a, b in true_ranges(cells[:, j])]
-                if bars:
-                    axes.broken_barh(
-                        bars,
-                        (y[j], y[j + 1] - y[j]),
-                        facecolor=colour,
-                        edgecolor=colour,  # no seams between the rows
-                        linewidth=0.4,
-                    )
+            # With an edge, there are no seams between rows.
+            look = {"facecolor": colour, "edgecolor": colour, "linewidth": 0.4}
+            axes.add_patch(PathPatch(_rectangles(cells, x, y), **look))
         axes.set_xlim(x[0], x[-1])
         axes.set_ylim(y[0], y[-1])
         axes.locator_params(nbins=5)
@@ -251,7 +246,7 @@ def draw_lengths(lengths: NDArray[Any], *, name: str, description: str) -> str:
     with drawing():
         figure = new_figure(_NARROW, 1.6)
         axes = figure.add_subplot()
-        axes.hist(lengths, edges, color=RECORDED, rwidth=0.9)
+        axes.hist(lengths, edges.tolist(), color=RECORDED, rwidth=0.9)
         axes.set_xlabel("length of a trajectory, transitions")
         axes.set_ylabel("trajectories")
         axes.locator_params(integer=True, nbins=5)
@@ -291,7 +286,7 @@ def draw_plan(
             _dots(axes, before, after, swapped)
             axes.annotate(
                 short_label(entity, 16),
-                after,
+                (after[0], after[1]),
                 # On three sides in turn, as entities may be close.
                 xytext=((0, 9), (0, -17), (10, -3))[number % 3],
                 textcoords="offset points",
@@ -350,6 +345,20 @@ def draw_marks(
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
         return svg_text(figure, name, description)
+
+
+def _rectangles(cells: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> Path:
+    """The outlines of cells ``[C0, C1]``, those next to each other as one."""
+    from matplotlib.path import Path
+
+    # The first entity is on the horizontal axis: a row of cells is a column here.
+    corners = [
+        [(x[a], y[j]), (x[b], y[j]), (x[b], y[j + 1]), (x[a], y[j + 1]), (x[a], y[j])]
+        for j in range(cells.shape[1])
+        for a, b in true_ranges(cells[:, j])
+    ]
+    codes = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
+    return Path(np.reshape(corners, (-1, 2)), codes * len(corners))
 
 
 def _dots(axes: Axes, before: Any, after: Any, swapped: bool) -> None:

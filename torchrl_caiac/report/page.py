@@ -7,13 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import torchrl_caiac
-from torchrl_caiac.report.contents import ReportContents, ReportSettings
+from torchrl_caiac.report.contents import ReportContents
+from torchrl_caiac.report.settings import ReportSettings
 from torchrl_caiac.report.svg import printable
 from torchrl_caiac.report.swaps import CELLS, PLANE
 from torchrl_caiac.scored import ScoredDataset
 
 __all__ = ["page_text", "settings_rows", "share_text", "usage_code"]
 
+# What the estimators of the command line do, for readers who do not know them.
+_ESTIMATORS = {
+    "motion": "it counts an entity as influenced where it moves in the recording, by "
+    "more than its noise",
+    "residual": "it counts an entity as influenced where a model of this entity alone "
+    "does not predict its motion",
+    "cai": "it asks a world model how much the next state of an entity depends on the "
+    "choice of the action",
+    "attention": "it reads the attention of a transformer world model from each entity "
+    "to the action",
+    "distance": "it counts an entity as influenced where the robot is near",
+}
 _FOLDER = Path(__file__).parent
 
 
@@ -61,6 +74,7 @@ def page_text(
         version=torchrl_caiac.__version__,
         style=Markup((_FOLDER / "page.css").read_text(encoding="utf-8")),
         svg=Markup,  # what this package drew, already escaped
+        estimator_text=_ESTIMATORS.get(scored.estimator, ""),
         cells=CELLS,
         plane=PLANE,
         code=escape(usage_code(scored)),
@@ -146,6 +160,8 @@ def settings_rows(content: dict[str, Any], prefix: str = "") -> list[tuple[str, 
     """
     rows = []
     for key, value in content.items():
+        if value is None:
+            continue
         if isinstance(value, dict):
             rows += settings_rows(value, f"{prefix}{key}.")
         else:

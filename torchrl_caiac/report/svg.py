@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ _VARIABLES = {
 }
 _SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _GEOMETRY = {"d", "x", "y", "width", "height", "transform", "points"}
-_RC = {
+_RC: Any = {
     "svg.fonttype": "none",  # text stays text: searchable, and in the page's font
     "svg.hashsalt": "torchrl-caiac",
     "text.parse_math": False,  # names may contain dollar signs
@@ -109,7 +109,7 @@ def short_label(name: str, most: int = 34) -> str:
 
 
 def printable(text: str) -> str:
-    """Returns text without control characters, which XML does not allow.
+    r"""Returns text without control characters, which XML does not allow.
 
     Args:
         text (str): the text.
@@ -119,7 +119,7 @@ def printable(text: str) -> str:
 
     Examples:
         >>> from torchrl_caiac.report.svg import printable
-        >>> printable("two\\nlines")
+        >>> printable("two\nlines")
         'two lines'
     """
     return "".join(

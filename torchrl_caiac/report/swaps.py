@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -116,20 +117,26 @@ def sample_swaps(
     rb.set_rng(generator)
     rb.append_transform(transform)
     parts: list[tuple[torch.Tensor, ...]] = []
-    for _ in range(-(-rows // _BATCH)):
-        batch, info = rb.sample(return_info=True)
-        drawn = torch.as_tensor(info["index"]).reshape(-1)
-        parts.append(
-            (
-                drawn,
-                layout.read(stored[drawn]),
-                layout.read(batch).clone(),
-                batch[transform.keys.counterfactual].reshape(-1),
-                batch[transform.keys.swapped],
+    with warnings.catch_warnings():
+        # The report says itself what is always free, or never.
+        warnings.filterwarnings("ignore", message="entities are free")
+        for _ in range(-(-rows // _BATCH)):
+            batch, info = rb.sample(return_info=True)
+            drawn = torch.as_tensor(info["index"]).reshape(-1)
+            parts.append(
+                (
+                    drawn,
+                    layout.read(stored[drawn]),
+                    layout.read(batch).clone(),
+                    batch[transform.keys.counterfactual].reshape(-1),
+                    batch[transform.keys.swapped],
+                )
             )
-        )
-    joined = [torch.cat(items) for items in zip(*parts, strict=True)]
-    return SampledSwaps(*joined, int(transform.no_donor_count.sum()))
+    drawn, recorded, made, chosen, swapped = (
+        torch.cat(items) for items in zip(*parts, strict=True)
+    )
+    no_donor = int(transform.no_donor_count.sum())
+    return SampledSwaps(drawn, recorded, made, chosen, swapped, no_donor)
 
 
 @dataclass(frozen=True)
@@ -197,7 +204,7 @@ class PairCoverage:
 
 
 def pair_coverage(
-    swaps: SampledSwaps, places: Mapping[str, Place], fixed: frozenset[str]
+    swaps: SampledSwaps, places: Mapping[str, Place], fixed: Collection[str]
 ) -> list[PairCoverage]:
     """Compares the combinations of places in recorded and in sampled states.
 
@@ -207,7 +214,7 @@ def pair_coverage(
     Args:
         swaps (SampledSwaps): the samples.
         places (mapping of str to Place): where each entity is, in layout order.
-        fixed (frozenset of str): entities that are never swapped.
+        fixed (collection of str): entities that are never swapped.
 
     Returns:
         list of PairCoverage: the pairs, those that gain most first.
@@ -223,7 +230,7 @@ def pair_coverage(
         ...     flags[:, 1], flags, 0)
         >>> places = {
         ...     "arm": Place((0,), ("x",), (0.0,)), "cup": Place((1,), ("y",), (0.0,))}
-        >>> pair = pair_coverage(swaps, places, frozenset(["arm"]))[0]
+        >>> pair = pair_coverage(swaps, places, ["arm"])[0]
         >>> pair.possible, pair.share_before, pair.share_after
         (4, 0.5, 0.5)
     """
@@ -318,7 +325,7 @@ def choose_examples(
     swaps: SampledSwaps,
     influenced: torch.Tensor,
     places: Mapping[str, Place],
-    fixed: frozenset[str],
+    fixed: Collection[str],
     index: TrajectoryIndex,
     count: int,
 ) -> list[int]:
@@ -334,7 +341,7 @@ def choose_examples(
         swaps (SampledSwaps): the samples.
         influenced (torch.Tensor): bool ``[T, N]``.
         places (mapping of str to Place): where each entity is, in layout order.
-        fixed (frozenset of str): entities that are never swapped.
+        fixed (collection of str): entities that are never swapped.
         index (TrajectoryIndex): the trajectories of the stored transitions.
         count (int): how many to choose, at most.
 

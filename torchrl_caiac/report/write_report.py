@@ -9,9 +9,10 @@ from typing import Literal
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._whole_files import whole_file
-from torchrl_caiac.report.contents import ReportSettings, collect_contents
+from torchrl_caiac.report.contents import collect_contents
 from torchrl_caiac.report.page import page_text
 from torchrl_caiac.report.pictures import RenderFn
+from torchrl_caiac.report.settings import ReportSettings
 from torchrl_caiac.scored import ScoredDataset
 
 __all__ = ["write_report"]
@@ -129,6 +130,8 @@ def write_report(
             f"counterfactual_ratio is {counterfactual_ratio}, expected above 0 and at "
             "most 1"
         )
+    if isinstance(render, str) and render != "auto":
+        raise ValueError(f"render is {render!r}, expected a function, 'auto' or None")
     if file.is_dir():
         raise FileExistsError(
             f"{file} is a folder: name a file in it, such as report.html"

@@ -58,7 +58,7 @@ class EntityThresholds:
         # What scores are compared with; ``None`` until it is known.
         self._limit: float | torch.Tensor | None = None
         self._numbers: dict[str, float] = {}
-        #: Entities of which ``"auto"`` knows that they are swapped always or never.
+        #: Entities that are known to be swapped always or never.
         self.expected: frozenset[str] = frozenset()
         if isinstance(given, str):
             if given != "auto":
@@ -192,6 +192,8 @@ class EntityThresholds:
 
     def _set(self, numbers: dict[str, float]) -> None:
         self._numbers = numbers
+        never = {name for name, number in numbers.items() if number < 0}
+        self.expected = self.expected | never
         self._limit = self._tensor()
 
     def _tensor(self) -> torch.Tensor:

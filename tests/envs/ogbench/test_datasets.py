@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 
 import numpy as np
 import pytest
@@ -173,3 +174,9 @@ def test_random_rows_mix_with_the_loaded_data(files, tmp_path):
     assert len(mixed) == len(data) + len(random)
     assert torch.equal(random["observation"][::2], data["observation"][::30])
     assert torch.equal(ogbench_states(random)[::2], states[::30])
+
+
+def test_a_missing_package_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ogbench.manipspace", None)
+    with pytest.raises(ImportError, match=r"torchrl-caiac\[ogbench\]"):
+        make_ogbench_env("scene")

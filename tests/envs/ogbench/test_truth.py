@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
+import torch
+from tensordict import TensorDict
 
 from tests.envs.ogbench.names import NAMES
 from torchrl_caiac.envs.ogbench import OGBenchTruth
-from torchrl_caiac.influence import true_influence
+from torchrl_caiac.influence import SimulatorInfluence, true_influence
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +75,25 @@ def test_what_is_out_of_reach_does_not_move(name, states, truths):
                 skipped += 1
                 assert np.ptp(after[:, own], 0).max() < 1e-6
     assert skipped
+
+
+def test_scores_from_the_entries_of_loaded_data(arrays, states, truths):
+    rows = slice(0, 60, 20)
+    keys = [("info", key) for key in ("qpos", "qvel", "button_states")]
+    data = TensorDict(
+        {key: torch.from_numpy(arrays["scene"][key[1]][rows]) for key in keys}, [3]
+    )
+    oracle = SimulatorInfluence(
+        functools.partial(OGBenchTruth, "scene"),
+        state_key=keys,
+        num_actions=4,
+        threshold=1e-3,
+    )
+    expected = true_influence(
+        truths["scene"],
+        states["scene"][rows],
+        num_actions=4,
+        threshold=1e-3,
+        progress=False,
+    )
+    assert torch.equal(oracle(data), expected.influenced.float())

@@ -5,16 +5,18 @@ from __future__ import annotations
 import functools
 import logging
 import os
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from torchrl_caiac._files import whole_file
-from torchrl_caiac.data.collect import collect_episodes, load_episode
+from torchrl_caiac.data.collect import (
+    collect_episodes,
+    collection_folder,
+    load_episode,
+)
 from torchrl_caiac.envs.ogbench.registration import check_name, make_ogbench_env
 
 if TYPE_CHECKING:
@@ -139,7 +141,7 @@ def create_ogbench_play(
         "noisy": noisy,
         **({"action_noise": action_noise} if noisy else {}),
     }
-    with _work_folder(work) as folder:
+    with collection_folder(work) as folder:
         report = collect_episodes(
             functools.partial(_Source, name, steps + 1, noisy),
             [spec] * episodes,
@@ -154,15 +156,6 @@ def create_ogbench_play(
             _write(partial, report.files)
     _logger.info("%s: %d episodes of %d steps of %s", target, episodes, steps, name)
     return target
-
-
-@contextmanager
-def _work_folder(work: str | os.PathLike[str] | None) -> Iterator[Path]:
-    if work is not None:
-        yield Path(work)
-        return
-    with tempfile.TemporaryDirectory(prefix="collection-") as folder:
-        yield Path(folder)
 
 
 def _write(partial: Path, files: Sequence[Path]) -> None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import mujoco
 import numpy as np
+import torch
+from gymnasium.spaces import Box
 
 from torchrl_caiac._keys import get_leaf
 from torchrl_caiac.envs.ogbench.entities import entity_joints, ogbench_layout
 from torchrl_caiac.envs.ogbench.registration import make_ogbench_env
 
 if TYPE_CHECKING:
-    import torch
     from numpy.typing import ArrayLike, NDArray
     from tensordict import TensorDictBase
     from tensordict.utils import NestedKey
@@ -22,7 +24,7 @@ __all__ = ["ROBOT", "OGBenchSimulator", "ogbench_states"]
 #: The name of the robot in the layouts.
 ROBOT = "robot"
 _BUTTONS = "button_states"
-# The share of the gripper's way at which its actuator is fully closed.
+# The command that closes the gripper.
 _CLOSED = 255.0
 
 
@@ -65,9 +67,6 @@ class OGBenchSimulator:
     has_rewards: ClassVar[bool] = False
 
     def __init__(self, name: str = "cube-double") -> None:
-        import mujoco
-
-        self._mujoco = mujoco
         self.name = name
         #: The entities of the observations.
         self.layout = ogbench_layout(name)
@@ -75,7 +74,7 @@ class OGBenchSimulator:
         self._env.reset(seed=0)
         self._task = self._env.unwrapped
         #: The box of the actions, [-1, 1].
-        self.action_space = self._task.action_space
+        self.action_space = Box(-1.0, 1.0, (5,), np.float32)
         joints = entity_joints(name)
         model = self.model
         #: Where in ``qpos`` each entity is.
@@ -148,7 +147,6 @@ class OGBenchSimulator:
         """
         qpos, qvel, buttons = self._parts(state)
         task, model, data = self._task, self.model, self.data
-        mujoco = self._mujoco
         mujoco.mj_resetData(model, data)
         # Unknown, and the next step sets it: this one holds the arm.
         data.ctrl[task._arm_actuator_ids] = qpos[task._arm_joint_ids]
@@ -338,9 +336,7 @@ class OGBenchSimulator:
         reach = radius[one, None] + radius[None, other] + distance
         pairs = np.argwhere(np.linalg.norm(centres, axis=-1) < reach)
         return any(
-            self._mujoco.mj_geomDistance(
-                self.model, data, one[i], other[j], distance, None
-            )
+            mujoco.mj_geomDistance(self.model, data, one[i], other[j], distance, None)
             < distance
             for i, j in pairs
         )
@@ -359,8 +355,8 @@ class OGBenchSimulator:
         task = self._task
         task.set_control(np.clip(action, -1, 1))
         task.pre_step()
-        self._mujoco.mj_step(self.model, self.data, nstep=task._n_steps)
-        self._mujoco.mj_rnePostConstraint(self.model, self.data)
+        mujoco.mj_step(self.model, self.data, nstep=task._n_steps)
+        mujoco.mj_rnePostConstraint(self.model, self.data)
         task.post_step()
 
     def _parts(
@@ -426,8 +422,6 @@ def ogbench_states(
         >>> ogbench_states(rows).shape
         torch.Size([4, 54])
     """
-    import torch
-
     if keys is None:
         keys = [("info", "qpos"), ("info", "qvel")]
         if data.get(("info", _BUTTONS), None) is not None:
