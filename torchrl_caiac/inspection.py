@@ -191,8 +191,8 @@ class Inspection:
             lines += ["", "action bounds: not stored"]
         lines += [
             "",
-            f"what moves when ({self.num_looked_at} transitions; from the begin to the "
-            "end of an episode)",
+            f"what moves when ({self.num_looked_at} transitions; from the beginning to "
+            "the end of an episode)",
             "group        columns              moves    when",
         ]
         for group in self.groups:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -244,6 +245,14 @@ def test_a_minari_dataset_that_is_not_there(
 ) -> None:
     result = caiac("inspect", name)
     assert result.code in (1, 2) and "nothing/there-v0" in result.error
+
+
+def test_without_minari_a_name_is_unknown(
+    caiac: Caiac, work: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "minari.storage", None)
+    result = caiac("inspect", "nothing/there-v0")
+    assert result.code == 2 and "nothing at nothing/there-v0" in result.error
 
 
 def test_an_unknown_format_by_name(caiac: Caiac, work: Path) -> None:

@@ -221,7 +221,7 @@ class _BarsOnly:
         self.encoding = terminal.encoding
 
     def write(self, text: str) -> int:
-        """Writes to the terminal what tqdm writes: it starts at the line's begin."""
+        """Writes to the terminal what tqdm writes: it begins with a return."""
         is_bar = text.startswith("\r") or not text.replace("\x1b[A", "").strip("\n")
         (self._terminal if is_bar else self._noise).write(text)
         return len(text)

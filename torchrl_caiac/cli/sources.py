@@ -226,7 +226,10 @@ def _minari_folder(source: str) -> Path | None:
         return None
     from torchrl_caiac.data.minari_files import dataset_path
 
-    folder = dataset_path(name if sign else source)
+    try:
+        folder = dataset_path(name if sign else source)
+    except ImportError:  # of Minari, which says where datasets are
+        return None
     return folder if folder.is_dir() else None
 
 
