@@ -43,6 +43,11 @@ def test_kitchen() -> None:
     frames = frames_of(ready_layout("kitchen/positions"), [state, opened])
     assert np.array_equal(frames, env.render_states(np.stack([state, opened])))
     assert not np.array_equal(frames[0], frames[1])
+    full = env.full_observation
+    (frame,) = frames_of(ready_layout("kitchen/franka"), [full])
+    own = np.concatenate([full[:9], full[18:39]])
+    assert full.shape == (59,) and np.allclose(own, state, atol=0.02)
+    assert np.array_equal(frame, env.render_states(np.float32(own)[None])[0])
     env.close()
 
 

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from tests.report.test_svg import HOSTILE
 from tests.report.walks import LAYOUT, scored_dataset, transitions
-from torchrl_caiac import EntityLayout
+from torchrl_caiac import EntityLayout, check_dataset
 from torchrl_caiac.data import offline_buffer, write_transitions
 from torchrl_caiac.influence import MotionInfluence, score_buffer, suggest_thresholds
 from torchrl_caiac.report import write_report
@@ -182,6 +182,17 @@ class TestContents:
         assert "Note: Never influenced are cup:" in page.text
         assert page.text.index("Error:") < page.text.index("Warning:")
         assert page.text.index("Warning:") < page.text.index("Note:")
+
+    def test_nothing_is_said_twice(self, tmp_path) -> None:
+        data = transitions(10, 40, 11)
+        data["action"][:] = 0.5
+        (finding,) = check_dataset(data, LAYOUT, variance_floor=0.01).findings
+        scored = scored_dataset(
+            data, LAYOUT, warnings=(f"{finding.message} (to do: think)", "Other.")
+        )
+        page = check_page(report(scored, tmp_path))
+        assert page.text.count(finding.message) == 1
+        assert finding.remedy in page.text and "Warning: Other." in page.text
 
     def test_no_problems(self, walks, tmp_path) -> None:
         page = check_page(report(walks, tmp_path))

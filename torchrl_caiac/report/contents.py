@@ -41,7 +41,6 @@ from torchrl_caiac.trajectories import trajectory_index
 __all__ = ["ReportContents", "collect_contents"]
 
 _logger = logging.getLogger("torchrl_caiac.report")
-_CHECKED_ROWS = 50_000
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ def collect_contents(
         trajectory_key=settings.trajectory_key,
         done_key=settings.done_key,
         action_spec=action_bounds(data),
-        max_rows=_CHECKED_ROWS,
+        variance_floor=layout.variance_floor or None,
     )
     swaps = sample_swaps(
         data,

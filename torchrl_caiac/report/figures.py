@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 # Inches. On a phone, a figure is about 340 pixels wide.
-_WIDTH, _NARROW = 4.6, 4.0
+_WIDTH, _NARROW = 4.3, 3.9
 _MOST_POINTS = 500  # of a curve
 Marks = Mapping[str, "tuple[NDArray[Any], NDArray[Any], bool]"]
 

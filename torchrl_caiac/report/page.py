@@ -155,8 +155,8 @@ def settings_rows(content: dict[str, Any], prefix: str = "") -> list[tuple[str, 
 
     Examples:
         >>> from torchrl_caiac.report.page import settings_rows
-        >>> settings_rows({"cai": {"actions": 64}, "smoothing": 1})
-        [('cai.actions', '64'), ('smoothing', '1')]
+        >>> settings_rows({"cai": {"actions": 64}, "spread": [0.25, 1 / 3]})
+        [('cai.actions', '64'), ('spread', '0.25, 0.3333')]
     """
     rows = []
     for key, value in content.items():
@@ -165,6 +165,15 @@ def settings_rows(content: dict[str, Any], prefix: str = "") -> list[tuple[str, 
         if isinstance(value, dict):
             rows += settings_rows(value, f"{prefix}{key}.")
         else:
-            text = value if isinstance(value, str) else json.dumps(value)
-            rows.append((f"{prefix}{key}", text))
+            rows.append((f"{prefix}{key}", _value_text(value)))
     return rows
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return ", ".join(map(_value_text, value))
+    return json.dumps(value)

@@ -26,8 +26,8 @@ _QUALITY = 82
 def known_renderer(layout: EntityLayout) -> RenderFn | None:
     """Returns a function that renders the states of a layout.
 
-    Known are the layouts of :class:`~torchrl_caiac.envs.KitchenEnv`, of
-    :class:`~torchrl_caiac.envs.FetchPushCubes` and of OGBench's manipulation
+    Known are the layouts of :class:`~torchrl_caiac.envs.KitchenEnv` and Franka-Kitchen,
+    of :class:`~torchrl_caiac.envs.FetchPushCubes` and of OGBench's manipulation
     environments.
 
     Args:
@@ -53,6 +53,9 @@ def known_renderer(layout: EntityLayout) -> RenderFn | None:
     ]
     if "kitchen/positions" in names:
         return lambda states: _kitchen(_observations(states, layout))
+    if "kitchen/franka" in names:  # with velocities
+        places = [*range(9), *range(18, 39)]
+        return lambda states: _kitchen(_observations(states, layout)[:, places])
     cubes = sum(name.startswith("cube") for name in layout.names)
     for name in names:
         if name.startswith("fetch_push_cubes/"):

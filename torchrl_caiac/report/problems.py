@@ -53,9 +53,15 @@ def find_problems(
     Returns:
         list of Problem: errors first, then warnings.
     """
+    messages = [finding.message for finding in check.findings]
     found = [
         *_findings(check),
-        *(Problem("warning", text.rstrip(".")) for text in warnings),
+        *(
+            Problem("warning", text.rstrip("."))
+            for text in warnings
+            # What was said of the same finding is not said twice.
+            if not any(message in text for message in messages)
+        ),
         *_threshold_problems(entities),
     ]
     if swaps.no_donor:
