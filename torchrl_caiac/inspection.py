@@ -189,11 +189,12 @@ class Inspection:
             lines += ["", f"action bounds: {self.bounds[0]} to {self.bounds[1]}"]
         else:
             lines += ["", "action bounds: not stored"]
+        width = max([12, *(len(group.name) for group in self.groups)])
         lines += [
             "",
             f"what moves when ({self.num_looked_at} transitions; from the beginning to "
             "the end of an episode)",
-            "group        columns              moves    when",
+            f"{'group':<{width}} columns              moves    when",
         ]
         for group in self.groups:
             bars = "".join(_BARS[math.ceil(8 * share - 1e-9)] for share in group.when)
@@ -202,7 +203,8 @@ class Inspection:
                 columns = f"{'.'.join(path_of(group.key))} {columns}"
             robot = "  moves with the action" if group.is_robot else ""
             lines.append(
-                f"{group.name:<12} {columns:<20} {group.moves:>6.1%}   |{bars}|{robot}"
+                f"{group.name:<{width}} {columns:<20} {group.moves:>6.1%}   "
+                f"|{bars}|{robot}"
             )
         if self.layouts:
             lines += ["", f"ready layouts that fit: {', '.join(self.layouts)}"]

@@ -249,10 +249,11 @@ def _coverage(context: Context) -> dict[str, Any] | None:
 
 def _show(scored: ScoredDataset, console: Console) -> None:
     console.text(f"{len(scored.data)} transitions, scored by {scored.estimator}\n")
-    console.text(f"{'entity':<18}{'threshold':>10}{'swappable':>11}   confidence")
+    width = max(map(len, ("entity", *scored.thresholds))) + 2
+    console.text(f"{'entity':<{width}}{'threshold':>10}{'swappable':>11}   confidence")
     for name, threshold in scored.thresholds.items():
         console.text(
-            f"{name:<18}{threshold:>10.4g}{scored.free[name]:>11.1%}   "
+            f"{name:<{width}}{threshold:>10.4g}{scored.free[name]:>11.1%}   "
             f"{scored.confidence[name]}"
         )
     console.text(f"\nwritten to {scored.path}; next: caiac report {scored.path}")
