@@ -157,6 +157,31 @@ def test_a_single_column_between_those_of_the_robot_is_its_own() -> None:
     assert list(found.proposal.columns.values()) == [(0, 1, 2), (3, 4)]
 
 
+def test_images_are_not_looked_at() -> None:
+    data = push_transitions()
+    for source in (data, data["next"]):
+        image = torch.rand(len(data), 3, 32, 32)
+        source["observation"] = TensorDict(
+            {"camera": image, "state": source["observation"]}, [len(data)]
+        )
+    found = inspect_dataset(data)
+    assert {fact.key for fact in found.columns} == {("observation", "state")}
+    assert any("camera" in note and "images" in note for note in found.notes)
+
+
+def test_an_image_alone_and_a_state_at_rest_give_no_proposal() -> None:
+    data = push_transitions()
+    for source in (data, data["next"]):
+        source["observation"] = torch.rand(len(data), 3, 32, 32)
+    assert inspect_dataset(data).proposal is None
+    for source in (data, data["next"]):
+        source["observation"] = torch.ones(len(data), 4)
+    found = inspect_dataset(data)
+    assert (
+        found.proposal is None and "no layout is proposed: nothing moves" in found.notes
+    )
+
+
 def test_no_robot_is_said() -> None:
     states, action = world(2, [2, 2], 0)
     found = inspect_dataset(transitions(states[:, 2:], action))

@@ -20,7 +20,9 @@ from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = ["ColumnFacts", "Inspection", "LeafFacts", "MovingGroup", "inspect_dataset"]
 
-_CHUNK = 1 << 16  # rows read at a time
+_CHUNK = 1 << 22  # numbers read at a time
+_MOST_NUMBERS = 20_000_000  # of the states in which columns are looked at
+_MOST_COLUMNS = 1024  # a wider leaf is an image
 _MOVES = 1e-3  # of a column's range: a change above it counts as motion
 _JITTER = 5e-3  # of the median range: a column with a smaller one does not move
 _ALWAYS = 0.5  # share of rows in which a column of the robot moves
@@ -187,11 +189,12 @@ class Inspection:
             lines += ["", f"action bounds: {self.bounds[0]} to {self.bounds[1]}"]
         else:
             lines += ["", "action bounds: not stored"]
+        width = max([12, *(len(group.name) for group in self.groups)])
         lines += [
             "",
-            f"what moves when ({self.num_looked_at} transitions; from the begin to the "
-            "end of an episode)",
-            "group        columns              moves    when",
+            f"what moves when ({self.num_looked_at} transitions; from the beginning to "
+            "the end of an episode)",
+            f"{'group':<{width}} columns              moves    when",
         ]
         for group in self.groups:
             bars = "".join(_BARS[math.ceil(8 * share - 1e-9)] for share in group.when)
@@ -200,7 +203,8 @@ class Inspection:
                 columns = f"{'.'.join(path_of(group.key))} {columns}"
             robot = "  moves with the action" if group.is_robot else ""
             lines.append(
-                f"{group.name:<12} {columns:<20} {group.moves:>6.1%}   |{bars}|{robot}"
+                f"{group.name:<{width}} {columns:<20} {group.moves:>6.1%}   "
+                f"|{bars}|{robot}"
             )
         if self.layouts:
             lines += ["", f"ready layouts that fit: {', '.join(self.layouts)}"]
@@ -282,31 +286,25 @@ def inspect_dataset(
     if isinstance(max_rows, bool) or not isinstance(max_rows, int) or max_rows < 1:
         raise ValueError(f"max_rows must be an int of at least 1, got {max_rows!r}")
     index = trajectory_index(data, trajectory_key=trajectory_key, done_key=done_key)
-    rows = torch.arange(0, len(data), math.ceil(len(data) / max_rows))
-    length = index.lengths[torch.searchsorted(index.ends, index.position(rows))]
-    tenth = (length - 1 - index.remaining(rows)) * _TENTHS // length
     observation_key = as_key(observation_key)
     observation = data.get(observation_key, None)
     if observation is None:
         raise missing_key(data, observation_key, _LACK, "pass observation_key")
+    is_nested = not isinstance(observation, torch.Tensor)
+    notes: list[str] = []
+    keys = _vectors(data, observation_key, notes)
+    width = sum(data.get(key)[0].numel() for key in keys)
+    most = max(1, min(max_rows, _MOST_NUMBERS // max(1, width)))
+    rows = torch.arange(0, len(data), math.ceil(len(data) / most))
+    length = index.lengths[torch.searchsorted(index.ends, index.position(rows))]
+    tenth = (length - 1 - index.remaining(rows)) * _TENTHS // length
     action = get_leaf(data, as_key(action_key), _LACK, "pass action_key")[rows]
     action = floating(action.flatten(1).as_subclass(torch.Tensor)).double()
-    is_nested = not isinstance(observation, torch.Tensor)
-    keys = (
-        [join(observation_key, key) for key in observation.keys(True, True)]
-        if is_nested
-        else [observation_key]
-    )
-    parts = [
-        _Columns(data, key, join(next_key, key), rows, action)
-        for key in keys
-        if data.get(key).shape[1:].numel()
-    ]
-    notes: list[str] = []
+    parts = [_Columns(data, key, join(next_key, key), rows, action) for key in keys]
     if is_nested:
         groups = _leaf_groups(parts, tenth)
     else:
-        groups = _column_groups(parts[0], tenth, notes)
+        groups = _column_groups(parts[0], tenth, notes) if parts else []
     bounds = action_bounds(data)
     if bounds is None:
         notes.append(
@@ -325,6 +323,23 @@ def inspect_dataset(
         notes=tuple(notes),
         layouts=tuple(layouts),
     )
+
+
+def _vectors(
+    data: TensorDictBase, observation_key: NestedKey, notes: list[str]
+) -> list[NestedKey]:
+    """Returns the leaves of the observation that are vectors of numbers."""
+    observation = data.get(observation_key)
+    keys: list[NestedKey] = [observation_key]
+    if not isinstance(observation, torch.Tensor):
+        keys = [join(observation_key, key) for key in observation.keys(True, True)]
+    wide = [key for key in keys if data.get(key)[0].numel() > _MOST_COLUMNS]
+    if wide:
+        notes.append(
+            f"{wide} have more than {_MOST_COLUMNS} numbers, like images, and are not "
+            "looked at: entities are parts of vectors"
+        )
+    return [key for key in keys if 0 < data.get(key)[0].numel() <= _MOST_COLUMNS]
 
 
 class _Columns:
@@ -515,9 +530,8 @@ def _proposal(
 ) -> EntityLayout | None:
     fixed = [group.name for group in groups if group.is_robot]
     if len(fixed) == len(groups):
-        notes.append(
-            "no layout is proposed: everything moves almost always, or with the action"
-        )
+        why = "everything moves almost always, or with the action"
+        notes.append(f"no layout is proposed: {why if groups else 'nothing moves'}")
         return None
     if not fixed:
         notes.append("no robot was found: name it in the layout, as fixed")
@@ -538,8 +552,9 @@ def _leaf_facts(data: TensorDictBase) -> list[LeafFacts]:
         if path_of(key)[0] == "caiac":
             continue
         low, high, bad = math.inf, -math.inf, 0
-        for begin in range(0, len(leaf), _CHUNK):
-            part = leaf[begin : begin + _CHUNK].as_subclass(torch.Tensor)
+        rows = max(1, _CHUNK // max(1, leaf[0].numel()))
+        for begin in range(0, len(leaf), rows):
+            part = leaf[begin : begin + rows].as_subclass(torch.Tensor)
             if part.is_floating_point():
                 finite = part[part.isfinite()]
                 bad += part.numel() - finite.numel()

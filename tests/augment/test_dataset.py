@@ -8,9 +8,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.augment.conftest import TOLERANCE
+from tests.augment.conftest import GOALS, TOLERANCE, score
 from tests.pushes import LAYOUT
-from torchrl_caiac.augment import augment_dataset
+from torchrl_caiac.augment import augment_dataset, needs_reward
 from torchrl_caiac.data import action_bounds, load_transitions, verify_digests
 from torchrl_caiac.scored import ScoredDataset
 from torchrl_caiac.trajectories import trajectory_index
@@ -157,6 +157,17 @@ def test_rewards_must_be_chosen(goals: ScoredDataset, tmp_path: Path) -> None:
             goals, tmp_path / "made", reward="sparse", tolerance=0.01, progress=False
         )
     assert not (tmp_path / "made").exists()
+
+
+def test_rewards_without_goals_in_the_data_are_kept(
+    plain: ScoredDataset, tmp_path: Path
+) -> None:
+    data = plain.data.exclude("caiac").to_tensordict()
+    data["next", "reward"] = torch.rand(len(data), 1)
+    scored = score(tmp_path / "rewarded", data, GOALS)
+    assert not needs_reward(scored)
+    made = augment_dataset(scored, tmp_path / "made", progress=False)
+    assert torch.isin(made["next", "reward"], data["next", "reward"]).all()
 
 
 def test_what_does_not_follow_is_left_out(goals: ScoredDataset, tmp_path: Path) -> None:

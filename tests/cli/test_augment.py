@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -12,8 +13,10 @@ import torch
 
 from tests.augment.conftest import GOALS, with_goals
 from tests.cli.conftest import Caiac
+from tests.killing import run_killed
 from tests.pushes import push_transitions
 from torchrl_caiac.augment import augment_dataset
+from torchrl_caiac.cli import main
 from torchrl_caiac.data import load_transitions, write_transitions
 from torchrl_caiac.scored import open_scored
 
@@ -151,3 +154,29 @@ def test_nothing_to_swap(caiac: Caiac, pushes: Path) -> None:
     result = caiac("augment", "few", "--out", "a.npz", "--trajectories")
     assert result.code == 1 and "no trajectory has" in result.error
     assert names() == before
+
+
+def killed_while_augmenting() -> Iterator[None]:
+    """Stops after the transitions, before the file."""
+    import torchrl_caiac.cli.augment as command
+
+    class _Stop(BaseException):
+        pass
+
+    def stop(*args: object, **kwargs: object) -> None:
+        raise _Stop
+
+    command.export_npz = stop
+    command.shutil.rmtree = lambda *args, **kwargs: None
+    try:
+        main(["augment", "scored", "--out", "a.npz"])
+    except _Stop:
+        yield
+
+
+def test_what_a_killed_call_left_is_removed(caiac: Caiac, scored: Path) -> None:
+    before = names()
+    run_killed(killed_while_augmenting)
+    assert names() > before and not Path("a.npz").exists()
+    assert caiac("augment", scored, "--out", "a.npz").code == 0
+    assert names() == before | {"a.npz"}

@@ -74,7 +74,7 @@ def test_nothing_to_propose(caiac: Caiac, pushes: Path) -> None:
 def test_ready_layouts_that_fit(caiac: Caiac, pushes: Path) -> None:
     data = push_transitions()
     for key in ("observation", ("next", "observation")):
-        wide = torch.rand(len(data), 25)
+        wide = 1 + torch.rand(len(data), 25)
         wide[:, 6:9] = wide[:, 3:6] - wide[:, 0:3]  # as in Gymnasium's Fetch
         data[key] = wide
     write_transitions(data, "fetch")

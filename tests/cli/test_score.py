@@ -16,7 +16,12 @@ from tests.pushes import LAYOUT, push_transitions
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.cli import main
 from torchrl_caiac.data import load_transitions, offline_buffer, write_transitions
-from torchrl_caiac.influence import MotionInfluence, score_buffer, suggest_thresholds
+from torchrl_caiac.influence import (
+    MotionInfluence,
+    ResidualInfluence,
+    score_buffer,
+    suggest_thresholds,
+)
 from torchrl_caiac.scored import open_scored
 
 SCORE = ("score", "pushes", "--layout", "layout.json", "--out", "scored")
@@ -198,6 +203,23 @@ def test_errors_in_the_data_end_it_before_scoring(caiac: Caiac, pushes: Path) ->
     assert result.code == 1
     assert "next_not_following" in result.error and "caiac check" in result.error
     assert ("caiac", "score") not in load_transitions("scored/data").keys(True)
+
+
+def test_residual_is_that_of_the_library(
+    caiac: Caiac, pushes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = ResidualInfluence.fit
+    monkeypatch.setattr(
+        ResidualInfluence, "fit", lambda *args, **kwargs: fit(*args, steps=50, **kwargs)
+    )
+    arguments = ("--estimator", "residual", "--far", "0.1", "--seed", "3")
+    result = caiac(*SCORE, *arguments)
+    assert result.code == 0, result.err
+    estimator = ResidualInfluence(LAYOUT, far=0.1)
+    estimator.fit(load_transitions("pushes"), seed=3, progress=False)
+    rb = offline_buffer(push_transitions())
+    score_buffer(rb, estimator, check=False, progress=False)
+    assert torch.equal(open_scored("scored").scores, rb.storage[:]["caiac", "score"])
 
 
 def test_cai_fits_resumes_and_lends_its_model(caiac: Caiac, pushes: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -218,11 +219,16 @@ def test_data_that_cannot_be_read(
     assert result.code == 1
     for word in words:
         assert word in result.error
-    # Nothing half-written stays; the folder remembers what it was for.
-    left = {
-        p for p in set(Path.cwd().rglob("*")) - before if not p.name.startswith(".")
-    }
-    assert {p.name for p in left} <= {"scored", "source.json"}
+    assert set(Path.cwd().rglob("*")) == before  # nothing half-written stays
+
+
+def test_a_folder_is_free_for_other_data_after_an_error(
+    caiac: Caiac, pushes: Path
+) -> None:
+    Path("scored").mkdir()
+    to = ("--layout", "layout.json", "--out", "scored")
+    assert caiac("score", not_finite(), *to).code == 1
+    assert caiac("score", pushes, *to).code == 0
 
 
 def test_episodes_of_one_row(caiac: Caiac, pushes: Path) -> None:
@@ -239,6 +245,14 @@ def test_a_minari_dataset_that_is_not_there(
 ) -> None:
     result = caiac("inspect", name)
     assert result.code in (1, 2) and "nothing/there-v0" in result.error
+
+
+def test_without_minari_a_name_is_unknown(
+    caiac: Caiac, work: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "minari.storage", None)
+    result = caiac("inspect", "nothing/there-v0")
+    assert result.code == 2 and "nothing at nothing/there-v0" in result.error
 
 
 def test_an_unknown_format_by_name(caiac: Caiac, work: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_caiac.augment.dataset import augment_dataset
+from torchrl_caiac.augment.dataset import augment_dataset, needs_reward
 from torchrl_caiac.augment.export import export_hdf5, export_npz
 from torchrl_caiac.augment.rewards import SparseReward, find_sparse_reward
 
@@ -12,4 +12,5 @@ __all__ = [
     "export_hdf5",
     "export_npz",
     "find_sparse_reward",
+    "needs_reward",
 ]

@@ -27,7 +27,7 @@ from torchrl_caiac.scored import ScoredDataset
 from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms import TransformKeys
 
-__all__ = ["augment_dataset"]
+__all__ = ["augment_dataset", "needs_reward"]
 
 _CHUNK = 1 << 14  # rows copied at a time
 _KEYS = TransformKeys()
@@ -71,7 +71,7 @@ def augment_dataset(
         reward (str, optional): the rewards of counterfactuals. ``"stored"``: those of
             the original transition; ``"sparse"``: recomputed, see
             :func:`~torchrl_caiac.augment.find_sparse_reward`. It must be given if the
-            layout has goals and the data have rewards. Defaults to ``None``:
+            data have rewards, and goals that the layout maps. Defaults to ``None``:
             ``"stored"``.
         tolerance (float, optional): that of sparse rewards. Defaults to ``None``: found
             in the data.
@@ -151,6 +151,22 @@ def augment_dataset(
     return load_transitions(Path(path))
 
 
+def needs_reward(scored: ScoredDataset) -> bool:
+    """Returns whether rewards must be chosen, since goals follow a swap.
+
+    Args:
+        scored (ScoredDataset): the dataset.
+
+    Returns:
+        bool: whether there are rewards, and goals that the layout maps.
+    """
+    data, layout = scored.data, scored.layout
+    keys = [layout.desired_goal_key] if layout.is_flat else list(layout.goal.values())
+    has_goals = any(key and data.get(key, None) is not None for key in keys)
+    has_rewards = data.get(_KEYS.reward, None) is not None
+    return bool(layout.goal) and has_goals and has_rewards
+
+
 def _count(ratio: float, originals: int) -> int:
     """Returns the number of counterfactuals, at least one."""
     return max(1, round(ratio / (1 - ratio) * originals))
@@ -219,12 +235,10 @@ def _rewards(
         raise ValueError(f"reward must be 'stored' or 'sparse', got {reward!r}")
     if tolerance is not None and reward != "sparse":
         raise ValueError("a tolerance is given, but not the sparse reward that has it")
-    has_rewards = scored.data.get(_KEYS.reward, None) is not None
-    if reward is None and scored.layout.goal and has_rewards:
+    if reward is None and needs_reward(scored):
         raise ValueError(
-            "the layout has goals and the data have rewards: say whether "
-            "counterfactuals keep the 'stored' rewards, or get 'sparse' ones of their "
-            "new goals"
+            "the data have goals and rewards: say whether counterfactuals keep the "
+            "'stored' rewards, or get 'sparse' ones of their new goals"
         )
     if reward != "sparse":
         return {}

@@ -11,7 +11,12 @@ from typing import Any, Literal
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_caiac._files import remove_leftovers_in, whole_file
-from torchrl_caiac.augment import augment_dataset, export_hdf5, export_npz
+from torchrl_caiac.augment import (
+    augment_dataset,
+    export_hdf5,
+    export_npz,
+    needs_reward,
+)
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
 from torchrl_caiac.cli.report import open_folder
@@ -71,7 +76,7 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         "--reward",
         choices=["stored", "sparse"],
         help="rewards of counterfactuals: those of the original, or sparse ones of the "
-        "new goals; must be given if the layout has goals and the data have rewards",
+        "new goals; must be given if the data have goals and rewards",
     )
     parser.add_argument(
         "--reward-tolerance",
@@ -106,22 +111,25 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise UsageError(f"--out {args.out} is inside of {folder}: write elsewhere")
     with console.step("reading the scored dataset"):
         scored = open_scored(folder)
-    if (
-        args.reward is None
-        and scored.layout.goal
-        and (scored.data.get(("next", "reward"), None) is not None)
-    ):
+    if args.reward is None and needs_reward(scored):
         raise UsageError(
-            "the layout has goals and the data have rewards: pass --reward sparse, or "
-            "--reward stored to keep the rewards of the originals"
+            "the data have goals and rewards: pass --reward sparse, or --reward stored "
+            "to keep the rewards of the originals"
+        )
+    if args.reward is None and ("next", "reward") in scored.data.keys(True):
+        console.warn(
+            "counterfactuals keep the rewards of their originals, which is right only "
+            "if these do not depend on what was swapped (--reward stored says that "
+            "this is meant)"
         )
     summary = _write(args, kind, scored, console)
     console.text(
         f"{summary['num_counterfactual']} counterfactual of "
         f"{summary['num_transitions']} transitions, written to {args.out}"
     )
+    width = max(map(len, scored.layout.names)) + 1
     for name, share in summary["swapped"].items():
-        console.text(f"  {name:<18}{share:>7.1%} of the counterfactual ones")
+        console.text(f"  {name:<{width}}{share:>7.1%} of the counterfactual ones")
     console.document(summary)
     return OK
 

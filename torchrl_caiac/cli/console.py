@@ -129,11 +129,10 @@ class Console:
     def step(self, name: str) -> Iterator[None]:
         """Writes the name of a step, and the seconds that it took if it took some."""
         begin = time.perf_counter()
-        if not self._is_terminal:
-            self.note(f"{name} ...")
+        self.note(f"{name} ...")
         yield
         seconds = time.perf_counter() - begin
-        if self._is_terminal or seconds >= 1:
+        if seconds >= 1:
             self.note(f"{name}: {seconds:.0f} s")
 
     # --- redirection -----------------------------------------------------------------
@@ -222,7 +221,7 @@ class _BarsOnly:
         self.encoding = terminal.encoding
 
     def write(self, text: str) -> int:
-        """Writes to the terminal what tqdm writes: it starts at the line's begin."""
+        """Writes to the terminal what tqdm writes: it begins with a return."""
         is_bar = text.startswith("\r") or not text.replace("\x1b[A", "").strip("\n")
         (self._terminal if is_bar else self._noise).write(text)
         return len(text)

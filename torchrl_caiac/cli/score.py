@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchrl_caiac._files import claim_folder, read_json, write_json
+from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.check import check_dataset
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
@@ -24,6 +24,7 @@ from torchrl_caiac.cli.sources import (
     describe_source,
     loader_options,
     open_named,
+    own_folder,
     read_layout,
     remove_scores,
 )
@@ -105,7 +106,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     folder = Path(args.out)
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is a file: give a folder")
-    with claim_folder(folder):
+    with own_folder(folder):
         data = convert(args.data, folder, described, console, overwrite=args.overwrite)
         replace = _settle(args, layout, settings, folder)
         context = Context(
@@ -248,10 +249,11 @@ def _coverage(context: Context) -> dict[str, Any] | None:
 
 def _show(scored: ScoredDataset, console: Console) -> None:
     console.text(f"{len(scored.data)} transitions, scored by {scored.estimator}\n")
-    console.text(f"{'entity':<18}{'threshold':>10}{'swappable':>11}   confidence")
+    width = max(map(len, ("entity", *scored.thresholds))) + 2
+    console.text(f"{'entity':<{width}}{'threshold':>10}{'swappable':>11}   confidence")
     for name, threshold in scored.thresholds.items():
         console.text(
-            f"{name:<18}{threshold:>10.4g}{scored.free[name]:>11.1%}   "
+            f"{name:<{width}}{threshold:>10.4g}{scored.free[name]:>11.1%}   "
             f"{scored.confidence[name]}"
         )
     console.text(f"\nwritten to {scored.path}; next: caiac report {scored.path}")

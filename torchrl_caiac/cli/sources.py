@@ -8,7 +8,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ __all__ = [
     "loader_options",
     "open_data",
     "open_named",
+    "own_folder",
     "read_layout",
     "remove_scores",
 ]
@@ -224,7 +226,10 @@ def _minari_folder(source: str) -> Path | None:
         return None
     from torchrl_caiac.data.minari_files import dataset_path
 
-    folder = dataset_path(name if sign else source)
+    try:
+        folder = dataset_path(name if sign else source)
+    except ImportError:  # of Minari, which says where datasets are
+        return None
     return folder if folder.is_dir() else None
 
 
@@ -277,7 +282,7 @@ def open_named(
     text = json.dumps(described, sort_keys=True)
     root = Path(cache) if cache else _cache_root()
     folder = root / hashlib.sha256(text.encode()).hexdigest()[:16]
-    with claim_folder(folder):
+    with own_folder(folder):
         return convert(source, folder, described, console)
 
 
@@ -319,7 +324,7 @@ def convert(
         raise UsageError(
             f"{folder} is not empty, and not from `caiac`: give another folder"
         )
-    if file.exists():
+    if file.exists() and data.is_dir():
         before = read_json(file, "description of a source", f"delete {folder}")
         if before != described and not overwrite:
             raise UsageError(
@@ -330,9 +335,26 @@ def convert(
             _remove(folder, (*_OF_SCORES, SETTINGS_FILE, DATA_FOLDER, SOURCE_FILE))
     if not data.is_dir():
         write_json(file, described)
-        with console.step(f"reading {source}"):
-            _convert(source, data, described, console)
+        try:
+            with console.step(f"reading {source}"):
+                _convert(source, data, described, console)
+        except BaseException:
+            file.unlink()
+            raise
     return load_transitions(data)
+
+
+@contextmanager
+def own_folder(folder: Path) -> Iterator[None]:
+    """Context manager that locks a folder, and removes it if it was and stays empty."""
+    is_new = not folder.exists()
+    try:
+        with claim_folder(folder):
+            yield
+    finally:
+        left = list(folder.iterdir()) if is_new and folder.is_dir() else []
+        if left and all(path.name.startswith(".lock") for path in left):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def remove_scores(folder: Path) -> None:
