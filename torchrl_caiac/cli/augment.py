@@ -1,4 +1,4 @@
-"""``caiac augment``: counterfactuals as files, for people who train elsewhere."""
+"""``caiac augment``: counterfactuals as files, to train with other libraries."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         "augment",
         help="write counterfactual transitions or trajectories to a file",
-        description="Writes a scored dataset with counterfactuals: transitions as "
-        "training on a buffer would see them, or whole trajectories. Goals follow the "
-        "swap; entries of infos are left out. Every transition has a flag that says "
-        "whether it is counterfactual.",
+        description="Writes a scored dataset with counterfactuals: transitions as the "
+        "replay buffer samples them in training, or whole trajectories. Goals follow "
+        "the swap; entries under `info` are left out. Every transition has a flag that "
+        "says whether it is counterfactual.",
         epilog=_EPILOG,
         **options,
     )
@@ -64,8 +64,8 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--trajectories",
         action="store_true",
-        help="whole trajectories: entities that are uninfluenced from beginning to end "
-        "come from other trajectories",
+        help="write whole trajectories: entities that are uninfluenced in all of a "
+        "trajectory come from another one",
     )
     parser.add_argument(
         "--no-originals",
@@ -86,7 +86,11 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         "stored rewards",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="default: %(default)s"
+        "--seed",
+        type=int,
+        default=0,
+        metavar="N",
+        help="the seed (default: %(default)s)",
     )
     parser.add_argument(
         "--overwrite", action="store_true", help="replace OUT if it exists"

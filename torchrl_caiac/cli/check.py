@@ -27,8 +27,8 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         help="look for errors in a dataset and its layout",
         description="Looks for what would make counterfactuals or scores wrong: "
         "missing entries, next states that do not follow, wrong ends, columns that do "
-        "not fit the layout, values that are not finite. Each finding says what it "
-        "does, and what to do.",
+        "not fit the layout, values that are not finite. Each finding has its effect, "
+        "and what to do.",
         epilog=_EPILOG,
         **options,
     )

@@ -30,14 +30,13 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         "demo",
         help="run the motivating experiment in the kitchen",
         description="Collects demonstrations in the Franka kitchen, fits a world "
-        "model, scores, and trains and evaluates policies with and without "
-        "counterfactuals: the same as `make demo`. It takes about an hour on two "
-        "cores; --quick is a smoke run of a few minutes that shows the steps, not the "
-        "result.",
+        "model, computes scores, and trains and evaluates policies with and without "
+        "counterfactuals: the same as `make demo`. --quick is a smoke test of the same "
+        "steps, whose numbers mean nothing.",
         epilog=_EPILOG,
         **options,
     )
-    parser.add_argument("--quick", action="store_true", help="a smoke run")
+    parser.add_argument("--quick", action="store_true", help="a smoke test")
     parser.add_argument(
         "--out",
         metavar="DIR",

@@ -141,29 +141,29 @@ _FIT: dict[str, Any] = {"steps": DEFAULT_FIT["steps"], "seed": 0, "world_model":
 #: By name. The first one is the default.
 ESTIMATORS: dict[str, EstimatorEntry] = {
     "motion": EstimatorEntry(
-        "what moves in the recording is influenced; needs nothing else",
+        "an entity that moves is influenced (needs no model)",
         _motion,
         {"tolerance": "auto"},
     ),
     "residual": EstimatorEntry(
-        "what moves otherwise than it would alone is influenced; for things that roll "
-        "or fall, with velocities in the observation",
+        "an entity that does not move as it would alone is influenced (for objects "
+        "that roll or fall; needs velocities in the observation)",
         _residual,
         {"tolerance": "auto", "far": None, "seed": 0},
     ),
     "cai": EstimatorEntry(
-        "causal action influence, by a world model; minutes, and data with different "
-        "actions in similar states",
+        "causal action influence by a world model (takes minutes; needs data with "
+        "different actions in similar states)",
         _cai,
         {**_FIT, "num_actions": 64},
     ),
     "attention": EstimatorEntry(
-        "attention of a transformer (CoDA-action); the same as cai",
+        "attention of a transformer, as in CoDA-action (needs the same as cai)",
         _attention,
         _FIT,
     ),
     "distance": EstimatorEntry(
-        "what is near the robot is influenced; needs positions and --distance",
+        "an entity near the robot is influenced (needs positions and --distance)",
         _distance,
         {"distance": None},
         needs_positions=True,
@@ -188,21 +188,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--tolerance",
         type=_tolerance,
         metavar="X",
-        help="motion, residual: the largest change that is not motion, in the data's "
-        "units, or auto: from the layout, or the noise at rest (default: auto)",
+        help="motion, residual: the largest change that does not count as motion, in "
+        "the units of the data; auto takes it from the layout, or from the noise at "
+        "rest (default: auto)",
     )
     group.add_argument(
         "--far",
         type=_positive,
         metavar="X",
-        help="residual: fit to rows in which the robot is at least this far away, in "
-        "the units of the positions (default: all rows)",
+        help="residual: fit to transitions in which the robot is at least this far "
+        "away, in the units of the positions (default: all transitions)",
     )
     group.add_argument(
         "--distance",
         type=_positive,
         metavar="X",
-        help="distance: how near counts as influenced, in the units of the positions",
+        help="distance: an entity is influenced up to this distance from the robot, in "
+        "the units of the positions",
     )
     group.add_argument(
         "--steps",
@@ -214,13 +216,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--seed",
         type=int,
         metavar="N",
-        help="residual, cai, attention: of the fit (default: 0)",
+        help="residual, cai, attention: the seed of the fit (default: 0)",
     )
     group.add_argument(
         "--num-actions",
         type=_count,
         metavar="N",
-        help="cai: sampled actions for each state (default: 64)",
+        help="cai: the number of sampled actions for each state (default: 64)",
     )
     group.add_argument(
         "--world-model",
@@ -232,8 +234,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DATA",
-        help="cai, attention: fit to these transitions too, such as random actions; "
-        "may be repeated",
+        help="cai, attention: fit to this dataset too, such as one with random "
+        "actions; may be repeated",
     )
 
 

@@ -27,8 +27,8 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         "inspect",
         help="show what is in a dataset, and propose a layout",
         description="Shows the entries, episodes, ranges and action bounds of a "
-        "dataset and what moves when, proposes a layout by grouping the columns that "
-        "move together, and names the ready layouts that fit.",
+        "dataset, and what moves when; proposes a layout, by grouping the columns that "
+        "move together; and names the ready layouts that fit.",
         epilog=_EPILOG,
         **options,
     )

@@ -42,7 +42,7 @@ __all__ = ["add_parser", "run"]
 _EPILOG = """\
 example:
   caiac score episodes.npz --layout ogbench/cube-double --out scored
-An interrupted call resumes where it stopped when it is repeated.
+To resume an interrupted call, repeat it.
 """
 
 
@@ -51,9 +51,9 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         "score",
         help="score a dataset, and suggest thresholds",
-        description="Writes a folder with the transitions, for each of them the "
-        "influence of the action on every entity, the layout and suggested thresholds. "
-        "The dataset itself is not changed.",
+        description="Writes a folder with the transitions, the influence of the action "
+        "on every entity in each of them, the layout, and suggested thresholds. The "
+        "dataset itself is not changed.",
         epilog=_EPILOG,
         **options,
     )
@@ -69,20 +69,21 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         type=int,
         default=1,
         metavar="N",
-        help="an entity counts as influenced if it is so in one of the next N states "
-        "(default: %(default)s)",
+        help="an entity counts as influenced if it is in this state or in one of the "
+        "next N (default: %(default)s)",
     )
     group.add_argument(
         "--smoothing",
         type=int,
         default=1,
         metavar="N",
-        help="the width of a moving average along the episode (default: %(default)s)",
+        help="the width of a moving average of the scores along the episode "
+        "(default: %(default)s)",
     )
     group.add_argument(
         "--overwrite",
         action="store_true",
-        help="replace what an earlier call with other data or settings left in DIR",
+        help="replace the output of an earlier call with other data or settings",
     )
     parser.set_defaults(run=run)
     return parser
@@ -231,7 +232,7 @@ def _write_scores(rb: Any, estimator: Any, context: Context, *, replace: bool) -
 
 
 def _coverage(context: Context) -> dict[str, Any] | None:
-    """Returns how far a world model's comparison of actions is backed by the data."""
+    """Returns how many different actions the data hold, if a world model is used."""
     if "num_actions" not in context.settings and "steps" not in context.settings:
         return None
     with context.console.step("looking at the actions"):
