@@ -88,12 +88,9 @@ def random_transitions(
     """Collects transitions of uniformly random actions from saved simulator states.
 
     A world model that is queried with uniform actions has to know their effects in the
-    states of the data (paper A.7), and expert data hold no other actions. About as many
-    rows as the data have are enough: 60,000 for 100,000 rows of OGBench's cube-double
-    raise the AUC of CAI from 0.96 to 0.99, and the kitchen uses as many as it has rows
-    of demonstrations. They are for the world model alone:
-    :func:`~torchrl_caiac.data.mix_trajectories` mixes them with the data, and
-    :func:`~torchrl_caiac.fit.fit_world_model` takes the mixture.
+    states of the data (paper A.7), and expert data hold no other actions. Collect about
+    as many rows as the data have. They are for the world model only: pass both to
+    :func:`~torchrl_caiac.fit.fit_world_model` as a list.
 
     The transitions ``[T]`` with ``T = S * actions_per_state * steps`` have
     ``"observation"``, ``"action"``, ``"episode"`` (int64 ``[T]``) and, under
