@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
@@ -56,6 +56,9 @@ def world(
 )
 def test_the_layout_of_a_world_comes_back(widths: list[int], seed: int) -> None:
     data = transitions(*world(len(widths), widths, seed))
+    change = data["next", "observation"] - data["observation"]
+    # An entity whose turn comes more often than not would count as the robot.
+    assume(bool(((change[:, 2:] != 0).float().mean(0) < 0.5).all()))
     found = inspect_dataset(data).proposal
     moved = data["observation"].amax(0) > data["observation"].amin(0)
     expected, place = {(0, 1)}, 2

@@ -14,6 +14,7 @@ PACKAGE = Path(torchrl_caiac.__file__).parent
 LAYERS = [
     {
         "_buffer_transform",
+        "_checks",
         "_columns",
         "_figures",
         "_files",

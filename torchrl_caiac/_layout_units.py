@@ -10,7 +10,13 @@ from torchrl_caiac._columns import check_names, disjoint_columns
 if TYPE_CHECKING:
     from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["FloorArgument", "entity_floors", "position_columns", "position_features"]
+__all__ = [
+    "FloorArgument",
+    "entity_floors",
+    "position_columns",
+    "position_features",
+    "position_places",
+]
 
 FloorArgument = float | Mapping[str, float | Sequence[float]] | None
 
@@ -153,14 +159,37 @@ def position_features(layout: EntityLayout, name: str, width: int) -> list[int]:
         >>> position_features(layout, "cup", 3)
         [1]
     """
-    if name not in layout.positions:
+    places = position_places(layout, name)
+    if not places:
         return list(range(width))
-    positions = layout.positions[name]
-    if layout.is_flat:
-        return [layout.columns[name].index(column) for column in positions]
-    if max(positions) >= width:
+    if max(places) >= width:
         raise ValueError(
-            f"positions give entity {name!r} the features {list(positions)}, but it "
-            f"has {width}: correct positions="
+            f"positions give entity {name!r} the features {places}, but it has "
+            f"{width}: correct positions="
         )
-    return list(positions)
+    return places
+
+
+def position_places(layout: EntityLayout, name: str) -> list[int]:
+    """Returns the places of an entity's positions in its features.
+
+    Args:
+        layout (EntityLayout): the entities.
+        name (str): the entity.
+
+    Returns:
+        list of int: the places, empty if the layout does not name its positions.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac._layout_units import position_places
+        >>> layout = EntityLayout(
+        ...     {"arm": [0], "cup": [4, 5, 6]}, positions={"cup": [5]}
+        ... )
+        >>> position_places(layout, "cup"), position_places(layout, "arm")
+        ([1], [])
+    """
+    positions = layout.positions.get(name, ())
+    if not layout.is_flat:
+        return list(positions)
+    return [layout.columns[name].index(column) for column in positions]

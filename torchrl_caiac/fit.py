@@ -15,6 +15,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Bounded, ReplayBuffer
 from tqdm.auto import tqdm
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._fit_quality import log_quality
 from torchrl_caiac._fit_rows import FitRows, split_rows, trajectory_numbers
 from torchrl_caiac._keys import as_key, jsonable
@@ -149,8 +150,7 @@ def fit_world_model(
         ("max_validation_rows", max_validation_rows),
         ("checkpoint_every", checkpoint_every),
     ):
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
+        check_int(name, value, 1)
     if not (lr > 0 and math.isfinite(lr)):
         raise ValueError(f"lr must be positive and finite, got {lr!r}")
     if not 0 < validation_fraction < 1:

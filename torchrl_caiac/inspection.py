@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._files import plain
 from torchrl_caiac._keys import as_key, floating, get_leaf, join, jsonable, missing_key
 from torchrl_caiac._keys import path as path_of
@@ -283,8 +284,7 @@ def inspect_dataset(
         >>> found.groups[1].moves
         0.25
     """
-    if isinstance(max_rows, bool) or not isinstance(max_rows, int) or max_rows < 1:
-        raise ValueError(f"max_rows must be an int of at least 1, got {max_rows!r}")
+    check_int("max_rows", max_rows, 1)
     index = trajectory_index(data, trajectory_key=trajectory_key, done_key=done_key)
     observation_key = as_key(observation_key)
     observation = data.get(observation_key, None)

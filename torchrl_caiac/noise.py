@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._layout_units import position_features
 from torchrl_caiac._torchrl import storage_rows
 from torchrl_caiac.entities import EntityLayout
@@ -151,8 +152,7 @@ def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDic
         >>> sample_rows(TensorDict({"x": torch.arange(9)}, [9]), 3)["x"]
         tensor([0, 4, 8])
     """
-    if isinstance(max_rows, bool) or not isinstance(max_rows, int) or max_rows < 1:
-        raise ValueError(f"max_rows must be an int of at least 1, got {max_rows!r}")
+    check_int("max_rows", max_rows, 1)
     if isinstance(data, ReplayBuffer):
         storage = data.storage
         data = storage_rows(storage)[: len(storage)]

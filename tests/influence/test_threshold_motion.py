@@ -12,7 +12,7 @@ from torchrl_caiac import EntityLayout
 from torchrl_caiac.influence.threshold_motion import (
     motion_of_rows,
     position_tolerances,
-    sample_rows,
+    sample_blocks,
     without_near_rests,
 )
 
@@ -44,7 +44,7 @@ def test_it_matches_one_row_after_the_other(lengths, lookahead, seed) -> None:
     kinds = torch.tensor([0.0, 0.05, 0.2, 0.5])
     change = kinds[torch.randint(4, (sum(lengths), 2), generator=generator)]
     td = data(change.tolist(), lengths)
-    sampled = sample_rows(td, len(td), lookahead=lookahead, max_rows=99, **KEYS)
+    sampled = sample_blocks(td, len(td), lookahead=lookahead, max_rows=99, **KEYS)
     found = motion_of_rows(
         td, LAYOUT, sampled, position_tolerances(td, LAYOUT), lookahead=lookahead
     )
@@ -64,7 +64,7 @@ def test_blocks_of_large_data_are_judged_by_rows_that_they_have() -> None:
     change[::7, 0] = 1.0
     td = data(change.tolist(), [3000, 3000])
     whole, part = (
-        sample_rows(td, 6000, lookahead=3, max_rows=most, **KEYS)
+        sample_blocks(td, 6000, lookahead=3, max_rows=most, **KEYS)
         for most in (9000, 3000)
     )
     tolerances = position_tolerances(td, LAYOUT)
@@ -74,20 +74,20 @@ def test_blocks_of_large_data_are_judged_by_rows_that_they_have() -> None:
     assert len(rows) == len(rows.unique()) == 3000
     known = some != -1
     assert torch.equal(some[known], every[rows][known]) and known.double().mean() > 0.99
-    again = sample_rows(td, 6000, lookahead=3, max_rows=3000, **KEYS)
+    again = sample_blocks(td, 6000, lookahead=3, max_rows=3000, **KEYS)
     assert torch.equal(again.rows, part.rows)
 
 
 def test_trajectories_are_needed_only_with_a_lookahead() -> None:
     td = data([[0.0, 0.0]], [1]).exclude("episode")
-    assert sample_rows(td, 1, lookahead=0, max_rows=9, **KEYS).rows.tolist() == [[0]]
+    assert sample_blocks(td, 1, lookahead=0, max_rows=9, **KEYS).rows.tolist() == [[0]]
     with pytest.raises(KeyError, match="episode"):
-        sample_rows(td, 1, lookahead=1, max_rows=9, **KEYS)
+        sample_blocks(td, 1, lookahead=1, max_rows=9, **KEYS)
 
 
 def test_nan_is_neither_motion_nor_rest() -> None:
     td = data([[0.0, 0.0], [float("nan"), 1.0]], [2])
-    sampled = sample_rows(td, 2, lookahead=0, max_rows=9, **KEYS)
+    sampled = sample_blocks(td, 2, lookahead=0, max_rows=9, **KEYS)
     found = motion_of_rows(td, LAYOUT, sampled, position_tolerances(td, LAYOUT))
     assert found["cup"].tolist() == [0, -1] and found["lid"].tolist() == [0, 1]
 
@@ -112,7 +112,7 @@ def test_tolerances_of_nested_entities_and_single_ones() -> None:
         },
         [2],
     )
-    sampled = sample_rows(td, 2, lookahead=0, max_rows=9, **KEYS)
+    sampled = sample_blocks(td, 2, lookahead=0, max_rows=9, **KEYS)
     assert motion_of_rows(td, layout, sampled, found)["cup"].tolist() == [0, 1]
 
 
@@ -130,7 +130,7 @@ def test_tolerances_are_measured_where_the_layout_has_none() -> None:
     td = data(noise.tolist(), [2000])
     (tolerance,) = position_tolerances(td, layout)["cup"]
     assert 2e-3 < tolerance < 0.15
-    sampled = sample_rows(td, 2000, lookahead=0, max_rows=9000, **KEYS)
+    sampled = sample_blocks(td, 2000, lookahead=0, max_rows=9000, **KEYS)
     found = motion_of_rows(td, layout, sampled, {"cup": tolerance.view(1)})["cup"]
     assert torch.equal(found == 1, torch.arange(2000) % 5 == 0)
 
@@ -155,5 +155,5 @@ def test_rests_near_motion_are_left_out(values: list[int]) -> None:
 def test_no_positions_say_nothing() -> None:
     layout = EntityLayout({"cup": [0]})
     td = data([[0.0, 0.0]], [1])
-    sampled = sample_rows(td, 1, lookahead=0, max_rows=9, **KEYS)
+    sampled = sample_blocks(td, 1, lookahead=0, max_rows=9, **KEYS)
     assert motion_of_rows(td, layout, sampled, position_tolerances(td, layout)) == {}

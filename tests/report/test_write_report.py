@@ -171,15 +171,15 @@ class TestContents:
             LAYOUT,
             thresholds={"cup": 2.0, "box": -1.0},
             confidence={"cup": "one mode: never influenced", "box": "unclear"},
-            reasons={"cup": "one heap", "box": "the heaps overlap"},
+            reasons={"cup": "one mode", "box": "the modes overlap"},
             warnings=("the actions are all from one expert",),
         )
         page = check_page(report(scored, tmp_path))
         assert "Error:" in page.text  # the row that does not follow
         assert "Warning: the actions are all from one expert." in page.text
-        assert "Warning: No clear threshold was found for box: the heaps" in page.text
+        assert "Warning: No clear threshold was found for box: the modes" in page.text
         assert "Effect: it is never swapped." in page.text
-        assert "Note: Never influenced are cup:" in page.text
+        assert "Note: cup: never influenced, so swaps are" in page.text
         assert page.text.index("Error:") < page.text.index("Warning:")
         assert page.text.index("Warning:") < page.text.index("Note:")
 
@@ -333,7 +333,7 @@ class TestDatasets:
         text = report(scored_dataset(data, layout), tmp_path)
         page = check_page(text)
         assert "All 120 pairs as a table" in page.text
-        assert "Not shown, as they are influenced never or less often" in page.text
+        assert "never or rarely influenced are not shown" in page.text
 
     def test_memory_mapped_data_stay(self, tmp_path) -> None:
         data = transitions(5, 8, 11)

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import last_written, storage_rows
 from torchrl_caiac.check.columns import check_columns, check_goals, unowned_columns
@@ -136,8 +137,7 @@ def check_dataset(
     """
     if not isinstance(layout, EntityLayout):
         raise TypeError(f"layout must be an EntityLayout, got {type(layout).__name__}")
-    if isinstance(max_rows, bool) or not isinstance(max_rows, int) or max_rows < 1:
-        raise ValueError(f"max_rows must be an int of at least 1, got {max_rows!r}")
+    check_int("max_rows", max_rows, 1)
     check = _Check(
         data,
         layout,

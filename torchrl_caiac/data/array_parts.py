@@ -139,7 +139,7 @@ class FlatArrays:
         states = entries(arrays.observations, "observations", where)
         count = len(self.ends.rows)
         self._extra = self._extra_states(steps, states, count)
-        # The last action of each episode, which leads nobody knows where.
+        # The last action of each episode, whose next state is unknown.
         self.lost = int(arrays.next_observations is None and not self._extra)
         self._check_entries(steps, states)
         self._info_is_by_state = (
@@ -201,7 +201,7 @@ class FlatArrays:
             if stop <= start:
                 raise ValueError(
                     f"{self._name(number)} has one observation and one action, and "
-                    "nobody knows where the action led: leave it out, or give "
+                    "the state after the action is unknown: leave it out, or give "
                     "next_observations"
                 )
             for first in range(start, stop, self._most):

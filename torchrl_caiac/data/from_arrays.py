@@ -50,17 +50,17 @@ def from_arrays(
 
     - **a list with one array for each episode**, for everything. (Or a mapping of such
       lists.)
-    - **flat arrays**, with the episodes one after another. What says where they end is
-      any of ``terminals`` and ``timeouts``, ``dones``, ``episode_lengths`` and
-      ``episode_ids``. Where several are given, they must agree.
+    - **flat arrays**, with the episodes one after another. Pass at least one of
+      ``terminals``, ``timeouts``, ``dones``, ``episode_lengths`` and ``episode_ids``,
+      which say where the episodes end. If you pass several, they must agree.
 
     In both, an episode with ``L`` actions has
 
     - ``L + 1`` observations, or
     - ``L`` observations and ``L`` ``next_observations``, or
-    - ``L`` observations alone. Then nobody knows where its last action led. **This row
-      is left out**, with its reward and flags, and the row before it counts as
-      truncated. A message in the log says so.
+    - ``L`` observations only. The state after its last action is then unknown. **This
+      transition is left out**, with its reward and flags, and the one before it counts
+      as truncated. A message in the log says so.
 
     The transitions ``[T]`` are those of
     :func:`~torchrl_caiac.data.episode_transitions`, with ``"episode"``, int64 ``[T]``.
@@ -162,8 +162,8 @@ def from_arrays(
         ):
             if value is not None:
                 raise ValueError(
-                    f"{name} is given, but a list has one array for each episode, "
-                    f"which says the same: leave out {name}, or give flat arrays"
+                    f"{name} is given, but a list has one array for each episode: "
+                    f"leave out {name}, or give flat arrays"
                 )
         episodes = given.episodes()
         parts, rows, total = episode_parts(episodes, lost), None, len(episodes)

@@ -13,8 +13,10 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import Bounded
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._fit_rows import trajectory_numbers
 from torchrl_caiac._keys import as_key, floating, get_leaf
+from torchrl_caiac._layout_units import position_places
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._action_bounds import check_actions, known_bounds
 
@@ -181,14 +183,8 @@ def action_coverage(
         >>> action_coverage(data, layout, action_spec=spec).verdict
         'many'
     """
-    for name, value, least in (
-        ("num_regions", num_regions, 1),
-        ("max_rows", max_rows, 50),
-    ):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(
-                f"{name} must be an int of at least {least}, got {value!r}"
-            )
+    check_int("num_regions", num_regions, 1)
+    check_int("max_rows", max_rows, 50)
     sources = [data] if isinstance(data, TensorDictBase) else list(data)
     state, action, trajectory = _read(
         sources, layout, as_key(action_key), as_key(trajectory_key), max_rows
@@ -300,10 +296,8 @@ def _differences(
 ) -> list[NDArray[np.float64]]:
     """Returns the positions of entities relative to the fixed ones, ``[n, 3]`` each."""
     places = {}
-    for name, positions in layout.positions.items():
-        own = layout.columns[name] if layout.is_flat else None
-        where = [p if own is None else own.index(p) for p in positions]
-        places[name] = state[:, slices[name]][:, where]
+    for name in layout.positions:
+        places[name] = state[:, slices[name]][:, position_places(layout, name)]
     return [
         place - places[reference]
         for reference in places

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 from tqdm.auto import tqdm
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._files import claim_folder
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import (
@@ -43,7 +44,7 @@ from torchrl_caiac.influence.score_record import (
     write_record,
 )
 from torchrl_caiac.influence.score_spread import warn_of_one_side
-from torchrl_caiac.influence.scorer import Scorer, check_int, layout_of
+from torchrl_caiac.influence.scorer import Scorer, layout_of
 from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
 
 __all__ = ["score_buffer"]

@@ -10,13 +10,13 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._buffer_transform import BufferTransform
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
 from torchrl_caiac._keys import as_key, missing_key
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.estimator_digest import DigestCache
 from torchrl_caiac.influence.score_record import score_settings, settings_digest
 from torchrl_caiac.influence.scorer import (
-    check_int,
     layout_of,
     reads_state_only,
     to_device_of,

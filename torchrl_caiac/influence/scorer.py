@@ -16,7 +16,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
 from torchrl_caiac.trajectories import TrajectoryIndex
 
-__all__ = ["Scorer", "check_int", "layout_of", "reads_state_only", "to_device_of"]
+__all__ = ["Scorer", "layout_of", "reads_state_only", "to_device_of"]
 
 _NAMED = 8  # rows that an error names
 _SAMPLE = 4096  # states that are passed to the estimator's prepare()
@@ -428,21 +428,6 @@ def to_device_of(estimator: Any, states: TensorDictBase) -> TensorDictBase:
         for tensor in (*estimator.parameters(), *estimator.buffers()):
             return states.to(tensor.device)
     return states
-
-
-def check_int(name: str, value: int, least: int) -> None:
-    """Raises an error if an argument is not an int in its range.
-
-    Args:
-        name (str): the name of the argument.
-        value (int): its value.
-        least (int): the smallest value allowed.
-
-    Raises:
-        ValueError: it is no int, or below ``least``.
-    """
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be an int of at least {least}, got {value!r}")
 
 
 def _in_keys(estimator: Any, layout: EntityLayout) -> list[NestedKey]:

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._layout_units import position_places
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.threshold_rule import MOVES, RESTS
 from torchrl_caiac.noise import resting_noise
@@ -18,7 +19,7 @@ __all__ = [
     "SampledRows",
     "motion_of_rows",
     "position_tolerances",
-    "sample_rows",
+    "sample_blocks",
     "without_near_rests",
 ]
 
@@ -44,7 +45,7 @@ class SampledRows(NamedTuple):
     remaining: torch.Tensor | None
 
 
-def sample_rows(
+def sample_blocks(
     data: TensorDictBase,
     length: int,
     *,
@@ -74,9 +75,9 @@ def sample_rows(
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_caiac.influence.threshold_motion import sample_rows
+        >>> from torchrl_caiac.influence.threshold_motion import sample_blocks
         >>> data = TensorDict({"episode": torch.tensor([0, 0, 0, 1, 1])}, [5])
-        >>> sample_rows(data, 5, lookahead=1, max_rows=9, trajectory_key="episode",
+        >>> sample_blocks(data, 5, lookahead=1, max_rows=9, trajectory_key="episode",
         ...     done_key=None).remaining
         tensor([[2, 1, 0, 1, 0]])
     """
@@ -140,7 +141,7 @@ def position_tolerances(
         floors = {name: noise[name].tolerance for name in names}
     result = {}
     for name in names:
-        places, floor = _features(layout, name), floors[name]
+        places, floor = position_places(layout, name), floors[name]
         if isinstance(floor, float):
             result[name] = torch.full((len(places),), floor).double()
         else:
@@ -177,12 +178,12 @@ def motion_of_rows(
         >>> from tensordict import TensorDict
         >>> from torchrl_caiac import EntityLayout
         >>> from torchrl_caiac.influence.threshold_motion import (
-        ...     motion_of_rows, position_tolerances, sample_rows)
+        ...     motion_of_rows, position_tolerances, sample_blocks)
         >>> layout = EntityLayout({"cup": [0]}, positions={"cup": [0]})
         >>> data = TensorDict({
         ...     "observation": torch.tensor([[0.0], [0.0], [0.9]]),
         ...     ("next", "observation"): torch.tensor([[0.0], [0.9], [1.1]])}, [3])
-        >>> sampled = sample_rows(data, 3, lookahead=0, max_rows=9,
+        >>> sampled = sample_blocks(data, 3, lookahead=0, max_rows=9,
         ...     trajectory_key=None, done_key=None)
         >>> tolerances = position_tolerances(data, layout, 0.1)
         >>> motion_of_rows(data, layout, sampled, tolerances)["cup"]
@@ -247,7 +248,7 @@ def _changes(
     slices = layout.slices(part)
     found = []
     for name, tolerance in tolerances.items():
-        places = [slices[name].start + place for place in _features(layout, name)]
+        places = [slices[name].start + place for place in position_places(layout, name)]
         size = change[:, torch.tensor(places, device=change.device)].abs().cpu()
         found.append((size / tolerance).amax(-1))
     return torch.stack(found, -1)
@@ -272,10 +273,3 @@ def _with_later(
         span += step
     last = torch.arange(size) + remaining.clamp_max(lookahead)
     return largest, last < size
-
-
-def _features(layout: EntityLayout, name: str) -> list[int]:
-    """Returns the places of an entity's positions among its features."""
-    if not layout.is_flat:
-        return list(layout.positions[name])
-    return [layout.columns[name].index(c) for c in layout.positions[name]]

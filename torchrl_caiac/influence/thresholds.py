@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._fingerprints import fingerprint_key, matches
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import storage_rows
@@ -22,12 +23,11 @@ from torchrl_caiac.data.offline_buffer import offline_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_record import read_record
 from torchrl_caiac.influence.score_spread import UNKNOWN, score_limits
-from torchrl_caiac.influence.scorer import check_int
 from torchrl_caiac.influence.threshold_motion import (
     SampledRows,
     motion_of_rows,
     position_tolerances,
-    sample_rows,
+    sample_blocks,
     without_near_rests,
 )
 from torchrl_caiac.influence.threshold_rule import (
@@ -294,7 +294,7 @@ def suggest_thresholds(
     if lookahead is None:
         lookahead = int(settings.get("lookahead", 0))
     check_int("lookahead", lookahead, 0)
-    sampled = sample_rows(
+    sampled = sample_blocks(
         data,
         length,
         lookahead=lookahead if layout.positions else 0,

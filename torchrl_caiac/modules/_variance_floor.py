@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
+from torchrl_caiac._layout_units import position_places
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.noise import resting_noise
 
@@ -100,7 +101,7 @@ class FloorFromData(nn.Module):
         floor: list[float] = []
         for name, own in self.predict.items():
             each = list(noise[name].floor)
-            places = _position_places(self.layout, name)
+            places = position_places(self.layout, name)
             # An object that is pushed hardly moves in height, but not more exactly.
             for place in places:
                 each[place] = max(noise[name].floor[p] for p in places)
@@ -199,14 +200,6 @@ def checked_floor(
             )
         floors += [float(v) for v in values]
     return floors
-
-
-def _position_places(layout: EntityLayout, name: str) -> list[int]:
-    """Returns the places of an entity's positions in its features, if known."""
-    positions = layout.positions.get(name, ())
-    if not layout.is_flat:
-        return list(positions)
-    return [layout.columns[name].index(column) for column in positions]
 
 
 def _is_deviation(value: Any) -> bool:

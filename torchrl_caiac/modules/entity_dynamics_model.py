@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._keys import as_key, floating, jsonable
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._finite import FiniteChecks, owner
@@ -128,10 +129,7 @@ class EntityDynamicsModel(
         inputs: Mapping[str, Iterable[int]] | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(action_dim, int) or action_dim < 1:
-            raise ValueError(
-                f"action_dim must be an int of at least 1, got {action_dim!r}"
-            )
+        check_int("action_dim", action_dim, 1)
         if target not in ("change", "absolute"):
             raise ValueError(f"target must be 'change' or 'absolute', got {target!r}")
         self.layout = layout

@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.modules import MLP
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac._keys import as_key
 from torchrl_caiac.modules.goal_features import GoalFeatures, read_leaves
 from torchrl_caiac.modules.linear import linear
@@ -186,7 +187,7 @@ class GoalConditionedActor(TensorDictModuleBase):
         action_key: NestedKey = "action",
     ) -> None:
         super().__init__()
-        _check_action_dim(action_dim)
+        check_int("action_dim", action_dim, 1)
         low, high = (torch.as_tensor(x).float().expand(action_dim) for x in (low, high))
         if not (low < high).all():
             raise ValueError(f"low must be below high, got {low} and {high}")
@@ -278,7 +279,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
         out_key: NestedKey = "state_action_value",
     ) -> None:
         super().__init__()
-        _check_action_dim(action_dim)
+        check_int("action_dim", action_dim, 1)
         # A loss stacks the buffers of its critics. Shared ones would become views of
         # one memory, to which load_state_dict cannot write.
         self.features = copy.deepcopy(features)
@@ -334,8 +335,3 @@ def takes_params(network: nn.Module) -> bool:
     """
     forward = type(network).forward
     return forward in (GoalConditionedActor.forward, GoalConditionedCritic.forward)
-
-
-def _check_action_dim(action_dim: int) -> None:
-    if not isinstance(action_dim, int) or action_dim < 1:
-        raise ValueError(f"action_dim must be an int of at least 1, got {action_dim!r}")

@@ -10,6 +10,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import nn
 
+from torchrl_caiac._checks import check_int
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._variance_floor import VarianceFloor
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
@@ -111,8 +112,7 @@ class TransformerWorldModel(EntityDynamicsModel):
             ("width", width),
             ("feedforward", feedforward),
         ):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
+            check_int(name, value, 1)
         if width % heads:
             raise ValueError(
                 f"width is {width}, expected a multiple of the {heads} heads: change "

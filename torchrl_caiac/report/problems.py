@@ -120,7 +120,7 @@ def _threshold_problems(entities: Sequence[Entity]) -> list[Problem]:
             f"{e.name} is never swapped: its score is above the threshold in every "
             "transition",
             "no counterfactual changes it",
-            "check that it ever rests; if so, the threshold is too low",
+            "check whether it ever rests; if so, the threshold is too low",
         )
         for e in never
     ]
@@ -130,7 +130,7 @@ def _threshold_problems(entities: Sequence[Entity]) -> list[Problem]:
         found.append(
             Problem(
                 "note",
-                f"Never influenced are {', '.join(expected)}: they may be swapped in "
+                f"{', '.join(expected)}: never influenced, so swaps are possible in "
                 "every transition",
             )
         )
@@ -139,9 +139,9 @@ def _threshold_problems(entities: Sequence[Entity]) -> list[Problem]:
         found.append(
             Problem(
                 "warning",
-                f"Swapped in every transition may be {', '.join(others)}: the score is "
-                "never above the threshold",
-                "if the agent does move them, counterfactuals are wrong",
+                f"{', '.join(others)}: swaps are possible in every transition, because "
+                "the score is never above the threshold",
+                "if the agent does move one of them, counterfactuals are wrong",
                 "look at their scores below",
             )
         )
