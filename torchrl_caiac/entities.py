@@ -56,17 +56,17 @@ class EntityLayout(LayoutFiles):
         achieved_goal_key (NestedKey): the key of the achieved goal, ``[*B, G]``.
             Defaults to ``"achieved_goal"``.
         positions (mapping of str to iterable of int, optional): the columns of some or
-            all entities that say where they are: coordinates, joint angles. Whatever
-            looks at motion (influence by motion or distance, reports) reads these
-            alone. Defaults to ``None``: unknown.
+            all entities that say where they are: coordinates, joint angles. Influence
+            by motion or distance, and reports, read only these columns. Defaults to
+            ``None``: unknown.
         variance_floor (float or mapping, optional): the standard deviation below which
             a change of a column is noise, in the units of the data. One number, or for
             each entity one number or one for each of its columns. World models and
             the influence by motion use it unless they are given another. Defaults to
             ``None``: unknown.
         width (int, optional): the number of columns ``D`` of the observation. Data of
-            another width are refused. Defaults to ``None``: any width that holds the
-            columns of the entities.
+            another width raise an error. Defaults to ``None``: any width that contains
+            the columns of the entities.
 
     Raises:
         ValueError: columns overlap, are negative or missing; a name in ``goal``,

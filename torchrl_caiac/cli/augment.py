@@ -19,7 +19,7 @@ from torchrl_caiac.augment import (
 )
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
-from torchrl_caiac.cli.report import open_folder
+from torchrl_caiac.cli.sources import scored_folder
 from torchrl_caiac.data import action_bounds, to_minari
 from torchrl_caiac.data.minari_files import dataset_path
 from torchrl_caiac.scored import ScoredDataset, open_scored
@@ -101,7 +101,7 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Runs the command."""
-    folder = open_folder(args.folder)
+    folder = scored_folder(args.folder)
     if not 0 < args.ratio < 1:
         raise UsageError(f"--ratio is {args.ratio}, expected between 0 and 1")
     if args.reward_tolerance is not None and args.reward != "sparse":

@@ -8,9 +8,10 @@ from typing import Any
 
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
+from torchrl_caiac.cli.sources import scored_folder
 from torchrl_caiac.scored import open_scored
 
-__all__ = ["add_parser", "open_folder", "run"]
+__all__ = ["add_parser", "run"]
 
 _EPILOG = """\
 example:
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     """Runs the command."""
     from torchrl_caiac.report import write_report
 
-    folder = open_folder(args.folder)
+    folder = scored_folder(args.folder)
     out = Path(args.out) if args.out else folder / "report.html"
     if out.is_dir():
         raise UsageError(f"--out {out} is a folder: give the name of a file")
@@ -60,23 +61,3 @@ def run(args: argparse.Namespace, console: Console) -> int:
     console.text(f"written to {written}")
     console.document({"written": str(written)})
     return OK
-
-
-def open_folder(name: str) -> Path:
-    """Returns the folder of an argument.
-
-    Args:
-        name (str): the argument.
-
-    Returns:
-        Path: the folder.
-
-    Raises:
-        UsageError: it does not exist.
-    """
-    folder = Path(name)
-    if not folder.is_dir():
-        raise UsageError(
-            f"the folder {folder} does not exist: create it with `caiac score`"
-        )
-    return folder

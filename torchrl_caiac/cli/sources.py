@@ -42,6 +42,7 @@ __all__ = [
     "own_folder",
     "read_layout",
     "remove_scores",
+    "scored_folder",
 ]
 
 #: What the transitions in a folder were made from, beside them; and how their scores
@@ -411,3 +412,23 @@ def _convert(
         if Path(source).name in text:
             raise
         raise ValueError(f"{source}: {text}") from error
+
+
+def scored_folder(name: str) -> Path:
+    """Returns the folder of a scored dataset.
+
+    Args:
+        name (str): the argument DIR.
+
+    Returns:
+        Path: the folder.
+
+    Raises:
+        UsageError: it does not exist.
+    """
+    folder = Path(name)
+    if not folder.is_dir():
+        raise UsageError(
+            f"the folder {folder} does not exist: create it with `caiac score`"
+        )
+    return folder

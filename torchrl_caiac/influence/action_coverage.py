@@ -120,17 +120,17 @@ def action_coverage(
 ) -> ActionCoverage:
     """Measures how many different actions the data hold from similar states.
 
-    A world model learns what an action does by comparison with other actions in similar
-    states. Data of one policy may hold none: what the model says of other actions is
-    then extrapolated, and so is the influence of the action.
+    A world model learns the effect of an action by comparison with other actions in
+    similar states. Data of one policy may have none. The model then extrapolates to
+    other actions, and so does the influence of the action.
 
-    The action is predicted from the state, each half of the trajectories by a
-    regression that was fitted to the other half: extremely randomised trees or, for
-    each column of the action the better of both, a linear one. They read the state and,
-    if ``layout.positions`` are known, the positions of the other entities relative to
-    the ``fixed`` ones. What the prediction
-    leaves is compared with uniform actions, in regions of similar states that k-means
-    finds. Columns of states are divided by their standard deviations.
+    The action is predicted from the state, in each half of the trajectories by
+    regressions that are fitted to the other half: extremely randomised trees and a
+    linear one, of which the better is used for each column of the action. They read the
+    state and, if ``layout.positions`` are known, the positions of the other entities
+    relative to the ``fixed`` ones. The residual of the prediction is compared with
+    uniform actions, in regions of similar states that k-means finds. Columns of states
+    are divided by their standard deviations.
 
     Args:
         data (TensorDictBase or sequence of them): transitions ``[T]``; several

@@ -1,4 +1,4 @@
-"""Influence read from the recording: what moves is influenced."""
+"""Influence from the recorded motion: an entity that moves is influenced."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ Tolerance = float | Mapping[str, float | Sequence[float]]
 
 
 class MotionInfluence(nn.Module):
-    r"""Counts an entity as influenced where it moves in the recorded transition.
+    r"""Counts an entity as influenced if it moves in the recorded transition.
 
-    No model is fitted, and no simulator or random-action data are needed. It is the
-    right choice where entities move only if the robot moves them. It is wrong where
-    they move by themselves (rolling, falling, conveyors, other agents): they then never
-    count as uninfluenced while they move. And it does not see that the robot *could*
-    have moved an entity, only that it did.
+    It needs no model, no simulator and no data of random actions. It suits entities
+    that move only if the robot moves them. Entities that move by themselves (rolling,
+    falling, conveyors, other agents) count as influenced while they move: use
+    :class:`~torchrl_caiac.influence.ResidualInfluence` for these. Entities that the
+    robot *could* have moved, but did not, count as uninfluenced.
 
     An entity has the score
 
     .. math:: d = \max_c |s'_c - s_c| / \tau_c
 
     over its position columns :math:`c` with tolerances :math:`\tau_c` if :math:`d > 1`,
-    and 0 if not. So every threshold in [0, 1) gives the same mask, the default of
+    and 0 if not. Every threshold in [0, 1) gives the same mask, the default of
     :class:`~torchrl_caiac.CAIACTransform` included. Choose the ``lookahead`` of
-    :func:`~torchrl_caiac.influence.score_buffer` so that it reaches the motion that an
-    action is for.
+    :func:`~torchrl_caiac.influence.score_buffer` as long as an action takes to have its
+    effect.
 
     The columns are ``layout.positions`` of the entity, or all of its columns if the
     layout does not name positions.
@@ -103,7 +103,7 @@ class MotionInfluence(nn.Module):
             self.tolerance = entity_floors(
                 tolerance, layout.names, layout.columns, "tolerance"
             )
-        # For each device and width of the state: the columns and what they divide by.
+        # For each device and width of the state: the output of `columns`.
         self._limits: dict[tuple[torch.device, int], list[torch.Tensor]] = {}
 
     @property

@@ -1,4 +1,4 @@
-"""Influence read from the recording: what an entity alone does not explain."""
+"""Influence from the recorded motion that an entity's own state does not explain."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _EntityAlone(nn.Module):
             num_cells=list(hidden_sizes),
             activation_class=nn.SiLU,
         )
-        # So the prediction is "nothing moves" until something else is learned.
+        # The prediction is "nothing moves" before the fit.
         nn.init.zeros_(self.net[-1].weight)
         nn.init.zeros_(self.net[-1].bias)
         self.features: torch.Tensor
@@ -62,7 +62,7 @@ class _EntityAlone(nn.Module):
 
 
 class ResidualInfluence(MotionInfluence):
-    r"""Counts an entity as influenced where its own state does not explain its motion.
+    r"""Counts an entity as influenced if its own state does not explain its motion.
 
     It generalises :class:`MotionInfluence` to entities that move by themselves, such as
     a ball that rolls on. A small network for each entity predicts the change of its
@@ -70,26 +70,23 @@ class ResidualInfluence(MotionInfluence):
 
     .. math:: d = \max_c |s'_c - s_c - f_{j,c}(s_j)| / \tau_c
 
-    over its position columns :math:`c` if :math:`d > 1`, and 0 if not. So the question
-    is whether this transition of the entity needed anything but the entity itself: a
+    over its position columns :math:`c` if :math:`d > 1`, and 0 if not. This is a
     pointwise form of transfer entropy, :math:`\log p(s'_j | s, a) - \log p(s'_j |
-    s_j)`, in which the first term is that of an exact observer, and the second a
-    Cauchy density with the scale :math:`\tau`.
+    s_j)`, with a constant as the first term, and a Cauchy density with the scale
+    :math:`\tau` as the second.
 
-    The networks are fitted by the maximum likelihood of that density. It is
-    heavy-tailed, so transitions that the entity's state does not explain hardly change
-    the fit, unless they are what usually follows from that state. They are then
-    mistaken for the entity's own motion. Therefore,
+    The networks maximise the likelihood of that density. It is heavy-tailed, so
+    transitions that the entity's state does not explain hardly change the fit, unless
+    most transitions from that state are of this kind. The network then learns them as
+    the entity's own motion. Therefore,
 
-    - velocities belong to the state: without them, rolling cannot be told from being
-      pushed;
+    - the state needs velocities: without them, rolling looks the same as being pushed;
     - demonstrations that always move an entity in the same way from the same place
-      look like its own motion. Pass ``agent`` and ``far``, if the layout has
-      positions in the same frame: the networks are then fitted to rows in which the
-      agent is at least that far away.
+      look like its own motion. Pass ``far``, if the layout has positions in the same
+      frame: the networks are then fitted to transitions in which the agent is at least
+      that far away.
 
-    Where entities rest unless they are moved, use :class:`MotionInfluence`, which
-    assumes exactly that.
+    Use :class:`MotionInfluence` for entities that rest unless they are moved.
 
     Args:
         layout (EntityLayout): the entities.
@@ -102,9 +99,9 @@ class ResidualInfluence(MotionInfluence):
             Defaults to ``(64, 64)``.
         agent (str, optional): the entity whose distance ``far`` is about. Defaults to
             the layout's only ``fixed`` one.
-        far (float, optional): the distance of the agent from which on a row tells what
-            an entity does alone, in the units of the positions. Defaults to ``None``:
-            all rows.
+        far (float, optional): the networks are fitted to transitions in which the
+            agent is at least this far from the entity, in the units of the positions.
+            Defaults to ``None``: all transitions.
 
     Raises:
         TypeError: a tolerance is not a number.
@@ -273,7 +270,7 @@ class ResidualInfluence(MotionInfluence):
     def _usable(
         self, state: torch.Tensor, name: str, rows: TensorDictBase
     ) -> torch.Tensor:
-        """Returns the rows that tell what an entity does alone, bool ``[n]``."""
+        """Returns the rows that the network of an entity is fitted to, bool ``[n]``."""
         if self.far is None or name == self.agent:
             return torch.ones(len(state), dtype=torch.bool)
         assert self.agent is not None

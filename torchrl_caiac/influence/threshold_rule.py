@@ -71,8 +71,8 @@ def split_scores(
 
     The start is Otsu's split of the logarithms of scores, the one with the largest
     variance between both sides; or half the smallest positive score, if some are zero.
-    Where motion is known, the threshold is moved as little as needed to tell moving
-    rows from resting ones almost as well as the best threshold for that does.
+    If motion is known, the threshold is moved as little as needed to separate moving
+    rows from resting ones almost as well as the best threshold.
 
     Args:
         scores (numpy.ndarray): finite, ``[n]``. Scores up to 0 count as 0.
@@ -122,7 +122,7 @@ def split_scores(
         if not (motion == RESTS).any() and low > 0 and high < _CONTRAST * low:
             reason = f"it moves in {counts}, and its scores differ little"
             return Split(threshold, "one mode: always influenced", reason, area)
-        reason = f"it moves in {counts}, so that motion tells nothing"
+        reason = f"it moves in {counts}, too few rest for a comparison"
         return Split(threshold, "unclear", reason, area)
     if len(moves) < fewest:
         reason = f"it moves in {counts} only, at least {fewest} rows are needed"
@@ -200,12 +200,12 @@ def _by_motion(
             f"{text}, at least {_AREA} needed: the estimator misses influence, or the "
             "entity moves by itself"
             if area < _AREA
-            else f"{text}, but no threshold tells both apart"
+            else f"{text}, but no threshold separates both"
         )
         return Split(threshold, "unclear", reason, area)
     how = "the scores' own split" if is_kept else "moved from the scores' own split"
     reason = (
-        f"{text}; the threshold ({how}) tells both apart with balanced accuracy "
+        f"{text}; the threshold ({how}) separates both with balanced accuracy "
         f"{float(accuracy[place]):.3f}"
     )
     return Split(threshold, "two clear modes", reason, area)
@@ -237,5 +237,5 @@ def _by_scores(
     )
     if is_clear:
         return Split(threshold, "two clear modes", modes, float("nan"))
-    reason = f"{modes}: give the layout positions, so that motion can tell"
+    reason = f"{modes}: give the layout positions, to compare the scores with motion"
     return Split(threshold, "unclear", reason, float("nan"))

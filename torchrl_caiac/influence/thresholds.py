@@ -222,13 +222,13 @@ def suggest_thresholds(
     (Otsu). If the layout has ``positions``, the split is compared with what moves in
     the recorded transitions: rows in which the entity moves must score above rows in
     which it rests (apart from those just before and after motion, in which the agent
-    may be able to move it). The split is kept if it tells both apart almost as well as
-    possible, and else moved to the nearest threshold that does. An entity that never
-    moves counts as never influenced. Where this is not clear, such as for an estimator
-    that misses influence or for entities that move by themselves, the entity is never
-    swapped.
+    may be able to move it). The split is kept if it separates both kinds of rows almost
+    as well as the best threshold. Otherwise it is moved to the nearest threshold that
+    does. An entity that never moves counts as never influenced. If no threshold
+    separates them, for example because the estimator misses influence or the entity
+    moves by itself, the entity is never swapped.
 
-    Without positions the scores alone must have two modes far apart.
+    Without positions, the scores must have two modes far apart.
 
     Args:
         source (ReplayBuffer, TensorStorage or TensorDictBase): transitions with scores,

@@ -31,21 +31,18 @@ _CLOSED = 255.0
 class OGBenchSimulator:
     """Simulates OGBench's manipulation environments from recorded states.
 
-    A state is a vector of ``"qpos"``, ``"qvel"`` and, where there are buttons,
-    ``"button_states"``, in this order, as OGBench's files have them. The next
-    observation is that of the recorded transition: of a state in float64 exactly. Files
-    have float32, whose rounding leaves at most 2 µm (and 2e-5 rad) of the entities in
-    400 transitions of cube-double, 10 µm in scene and puzzle-3x3. More is possible
-    where an episode starts, if a cube was put on the table, or into another one: they
-    fly apart, and the rounding decides how.
+    A state is a vector of ``"qpos"``, ``"qvel"`` and, if there are buttons,
+    ``"button_states"``, in this order, as OGBench's files have them. From a state in
+    float64, an action leads to exactly the recorded next observation. Files have
+    float32, and the rounding changes the next observation: by less than 0.2 mm for
+    cubes, in the tests. The error can be larger in the first transition of an episode,
+    if a cube touches the table or another cube there.
 
     OGBench's environments depend on more than positions and velocities. Their
-    controller starts from the place of the gripper that was computed one substep of
-    2 ms before the state, where nothing has computed it anew. This class computes that
-    place from the velocities. (With the place in the state itself, joint angles differ
-    by up to 2e-3 rad and the cubes' positions by up to 0.6 mm.) The gripper's command
-    is not recorded: only the observed contact of the gripper, column 18, depends on it,
-    and in a restored state that column is approximate, until the first step.
+    controller starts from the position of the gripper one substep of 2 ms before the
+    state. This class computes that position from the velocities. The gripper's command
+    is not recorded. Only the observed contact of the gripper, column 18, depends on it:
+    in a restored state that column is approximate, until the first step.
 
     Args:
         name (str): one of :data:`OGBENCH_ENVS`. Defaults to ``"cube-double"``.

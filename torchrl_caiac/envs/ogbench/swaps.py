@@ -1,4 +1,4 @@
-"""Whether swapped transitions are possible, by simulating them again in OGBench."""
+"""Whether swapped transitions are possible, by simulating them in OGBench."""
 
 from __future__ import annotations
 
@@ -32,16 +32,15 @@ def resimulate_swaps(
     num_workers: int = 0,
     progress: bool = True,
 ) -> NDArray[np.float32]:
-    """Simulates counterfactual transitions, and compares them with what is claimed.
+    """Simulates counterfactual transitions, and compares their next states.
 
     A counterfactual transition takes some entities from a donor, before and after the
-    action, and leaves the action and the other entities as they are. It is possible if
-    the simulator agrees: this function puts the simulator into the state with swapped
-    entities (places and velocities; button states with their buttons), applies the
-    action, and returns how far from its claimed place each entity is then. A cube that
-    is swapped into another one, into the hand, or off the cube that it lies on, ends
-    elsewhere. Without swaps the distances are below 0.01 mm, see
-    :class:`OGBenchSimulator`.
+    action, and keeps the action and the other entities. This function restores the
+    state with swapped entities (positions and velocities, and the states of buttons),
+    applies the action, and returns how far each entity then is from its place in the
+    counterfactual next state. The distance is large if a cube was swapped into another
+    one, into the hand, or off the cube that it lies on. Without swaps, the distances
+    are below 0.1 mm, see :class:`OGBenchSimulator`.
 
     Args:
         env (str or OGBenchSimulator): one of :data:`OGBENCH_ENVS`, or its simulator.

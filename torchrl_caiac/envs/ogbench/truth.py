@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["OGBenchTruth"]
 
-# Metres that the robot's links and an entity come closer in a step, at most.
+# Metres: more than the robot's links and an entity come closer in a step.
 _WAY = 0.08
 _STEP = 0.05  # seconds
 
@@ -60,9 +60,8 @@ class OGBenchTruth:
         """Returns which entities an action might move: a safe and fast bound.
 
         An entity is in reach if the gap between it and the robot, or another entity in
-        reach, is smaller than 8 cm and the way of the fastest entity in a step. In 800
-        states of cube-double, scene and puzzle-3x3, no action bridged a gap wider than
-        5 cm. Actions that are repeated for several steps were not measured.
+        reach, is smaller than 8 cm plus the distance that the fastest entity covers in
+        a step. For ``horizon`` steps the gap is that many times as large.
 
         Args:
             state (array_like): ``[S]``, see :class:`OGBenchSimulator`.
