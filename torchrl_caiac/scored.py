@@ -60,7 +60,7 @@ class Suggestions(Protocol):
 
     @property
     def confidence(self) -> Mapping[str, str]:
-        """How sure each of them is."""
+        """How clear each of them is."""
 
     @property
     def reasons(self) -> Mapping[str, str]:
@@ -84,16 +84,16 @@ class ScoredDataset:
             and those of the estimator, JSON values.
         thresholds (dict of str to float): the suggested threshold of each entity that
             is not fixed.
-        confidence (dict of str to str): how sure each threshold is.
+        confidence (dict of str to str): how clear each threshold is.
         reasons (dict of str to str): why.
         free (dict of str to float): the share of rows in which each entity is
             uninfluenced.
         source (dict): what the transitions were made from, JSON values. Defaults to
             ``{}``.
-        warnings (tuple of str): what whoever uses the scores should know. Defaults to
-            ``()``.
-        coverage (dict, optional): how much of the action space the data have seen,
-            JSON values. Defaults to ``None``: not computed.
+        warnings (tuple of str): warnings for users of the scores. Defaults to ``()``.
+        coverage (dict, optional): how many different actions the data have, see
+            :func:`~torchrl_caiac.influence.action_coverage`. Defaults to ``None``: not
+            computed.
         score_key (NestedKey): the scores, ``[T, N]``. Defaults to
             ``("caiac", "score")``.
 
@@ -110,7 +110,7 @@ class ScoredDataset:
         ...     settings={"smoothing": 1, "lookahead": 1},
         ...     thresholds={"cup": 0.5},
         ...     confidence={"cup": "two clear modes"},
-        ...     reasons={"cup": "the cup moves by itself never"},
+        ...     reasons={"cup": "the cup never moves by itself"},
         ...     free={"cup": 1.0},
         ... )
         >>> scored.scores
@@ -142,14 +142,11 @@ class ScoredDataset:
     def is_free(self) -> torch.Tensor:
         """Which entities are uninfluenced in each row, bool ``[T, N]``.
 
-        Never a fixed one, nor one without a threshold.
+        Fixed entities, and those without a threshold, are not.
         """
-        limits = [
-            self.thresholds.get(name, -math.inf)
-            if name not in self.layout.fixed
-            else -math.inf
-            for name in self.layout.names
-        ]
+        fixed = dict.fromkeys(self.layout.fixed, -math.inf)
+        known = {**self.thresholds, **fixed}
+        limits = [known.get(name, -math.inf) for name in self.layout.names]
         scores = self.scores.as_subclass(torch.Tensor)
         return scores <= torch.tensor(limits, dtype=scores.dtype)
 
@@ -185,10 +182,10 @@ def write_scored(
         settings (mapping): how the scores were computed, JSON values.
         source (mapping, optional): what the transitions were made from, JSON values.
             Defaults to ``None``: unknown.
-        warnings (sequence of str): what whoever uses the scores should know. Defaults
-            to ``()``.
-        coverage (mapping, optional): how much of the action space the data have seen,
-            JSON values. Defaults to ``None``: not computed.
+        warnings (sequence of str): warnings for users of the scores. Defaults to
+            ``()``.
+        coverage (mapping, optional): how many different actions the data have, JSON
+            values. Defaults to ``None``: not computed.
         score_key (NestedKey): the scores. Defaults to ``("caiac", "score")``.
 
     Returns:
@@ -264,9 +261,9 @@ def open_scored(path: str | os.PathLike[str], *, verify: bool = True) -> ScoredD
         path (path): the folder that ``caiac score`` or :func:`write_scored` wrote.
 
     Keyword Args:
-        verify (bool): read all transitions and compare them with their digests (a
-            second for each gigabyte, or two). Digests of layout and scores are always
-            compared. Defaults to ``True``.
+        verify (bool): whether to read all transitions and compare them with their
+            digests. Digests of layout and scores are always compared. Defaults to
+            ``True``.
 
     Returns:
         ScoredDataset: the dataset, its transitions memory-mapped.
@@ -298,15 +295,7 @@ def open_scored(path: str | os.PathLike[str], *, verify: bool = True) -> ScoredD
         )
     content = read_json(file, "description of a scored dataset", _AGAIN)
     _check_content(content, file)
-    layout_file = folder / LAYOUT_FILE
-    if not layout_file.exists():
-        raise UnreadableFileError(f"{layout_file} is missing: {_AGAIN}")
-    layout = EntityLayout.load(layout_file)
-    if layout_digest(layout) != content["layout_digest"]:
-        raise UnreadableFileError(
-            f"{layout_file} is not the layout that the scores were computed with: "
-            f"{_AGAIN}"
-        )
+    layout = _open_layout(folder, content["layout_digest"])
     tables: dict[str, Any] = {name: content[name] for name in _TABLES}
     try:
         _check_tables(tables, layout)
@@ -342,6 +331,18 @@ def open_scored(path: str | os.PathLike[str], *, verify: bool = True) -> ScoredD
         score_key=score_key,
         **tables,
     )
+
+
+def _open_layout(folder: Path, digest: str) -> EntityLayout:
+    file = folder / LAYOUT_FILE
+    if not file.exists():
+        raise UnreadableFileError(f"{file} is missing: {_AGAIN}")
+    layout = EntityLayout.load(file)
+    if layout_digest(layout) != digest:
+        raise UnreadableFileError(
+            f"{file} is not the layout that the scores were computed with: {_AGAIN}"
+        )
+    return layout
 
 
 def _open_data(folder: Path) -> TensorDict:

@@ -120,13 +120,9 @@ def augment_dataset(
         first = first.exclude(*_scores(scored))
         stored = first.expand(before + rows).memmap_like(folder)
         reserve(folder)
-        for begin in range(0, before, _CHUNK):
-            part = data[begin : min(begin + _CHUNK, before)].to_tensordict()
-            part = _flagged(part, scored).select(*first.keys(True, True))
-            stored[begin : begin + len(part)].update_(part)
+        _copy(data[:before], stored, scored)
         place, episode = before, len(index.ends) if originals else 0
-        bar = tqdm(total=number, disable=not progress, desc=kind, unit="")
-        with bar:
+        with tqdm(total=number, disable=not progress, desc=kind, unit="") as bar:
             for part in parts:
                 part = part.select(*first.keys(True, True))
                 ids = torch.arange(len(part)) if kind == "transitions" else 0
@@ -208,6 +204,14 @@ def _keys(values: list[Any]) -> Iterator[Any]:
             yield from value
         elif value is not None and all(isinstance(part, str) for part in value):
             yield value
+
+
+def _copy(data: TensorDictBase, stored: TensorDictBase, scored: ScoredDataset) -> None:
+    """Writes originals to the first rows of the result."""
+    keys = list(stored.keys(True, True))
+    for begin in range(0, len(data), _CHUNK):
+        part = _flagged(data[begin : begin + _CHUNK].to_tensordict(), scored)
+        stored[begin : begin + len(part)].update_(part.select(*keys))
 
 
 def _flagged(rows: TensorDictBase, scored: ScoredDataset) -> TensorDictBase:

@@ -31,8 +31,8 @@ _logger = logging.getLogger("torchrl_caiac.data.add_leaf")
 def add_leaf(data: TensorDictBase, key: NestedKey, values: Any) -> torch.Tensor:
     """Adds a leaf to transitions, and to their folder.
 
-    Opened transitions are locked, and ``data[key] = values`` is an error. After
-    ``unlock_()`` it is none, but the leaf is in memory only, until
+    Opened transitions are locked, and ``data[key] = values`` raises an error. After
+    ``unlock_()`` it works, but the leaf is in memory only, until
     :func:`~torchrl_caiac.data.offline_buffer` or
     :func:`~torchrl_caiac.influence.score_buffer` writes it to the folder.
 

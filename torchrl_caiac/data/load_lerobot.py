@@ -79,12 +79,12 @@ def load_lerobot(
     stored as ``"columns"`` of :func:`~torchrl_caiac.data.digests.data_source`. Images,
     videos and texts are left out.
 
-    LeRobot stores no next observation. The last frame of an episode has an action that
-    leads nowhere: its row is left out, with its reward and its ``next.done``. Hence the
-    last row of an episode counts as truncated.
+    LeRobot stores no next observations. The last frame of an episode therefore has
+    none: its row is left out, with its reward and its ``next.done``. The last row of an
+    episode counts as truncated.
 
     The package ``pyarrow`` reads the files. TorchRL's ``LeRobotExperienceReplay`` is
-    not used, because it reads no folder on this machine, stores no next observations,
+    not used, because it does not read local folders, does not store next observations,
     and does not check that episodes are whole.
 
     Args:
@@ -295,8 +295,7 @@ def _announce(
 ) -> dict[str, list[int]] | None:
     """Logs what is left out or joined, and returns the columns of what is joined."""
     _logger.info(
-        "%s has no next observations: the last frame of each episode is left out, "
-        "because its action leads nowhere",
+        "%s has no next observations: the last frame of each episode is left out",
         description.root,
     )
     read = {*names.all(), *exclude, *_POSITIONS}

@@ -68,9 +68,9 @@ def load_ogbench(
     as ``qpos``, ``qvel`` and ``button_states``, are kept under ``"info"``: row ``t``
     has the one of its state.
 
-    OGBench's files have one row for each state. The action of the last row of an
-    episode, where ``terminals`` is 1, leads nowhere: this row only gives the next
-    observation of the row before. Files with ``next_observations`` or ``valids``, as
+    OGBench's files have one row for each state. The last row of an episode, where
+    ``terminals`` is 1, has no next state: it is only the next observation of the row
+    before. Files with ``next_observations`` or ``valids``, as
     ``ogbench.make_env_and_datasets`` returns them, are read as well. No episode of
     OGBench ends by its task: the last row counts as truncated.
 

@@ -62,13 +62,12 @@ def load_robomimic(
     ``"observation"``. The columns of each are then logged, and stored as ``"columns"``
     of :func:`~torchrl_caiac.data.digests.data_source`.
 
-    The next observations are those of ``next_obs``. Without them, and without one
+    The next observations are those of ``next_obs``. If there are none, and not one
     observation more than actions, the last action of each demonstration has no next
     observation, and its row is left out.
 
-    A demonstration ends when the recording does, also after a success: robosuite's
-    environments go on. Hence its last row counts as truncated. ``dones`` are kept with
-    ``infos=["dones"]``.
+    robosuite's environments do not end after a success, so the last row of a
+    demonstration counts as truncated. ``infos=["dones"]`` keeps the file's ``dones``.
 
     The package ``h5py`` is needed, robomimic and robosuite are not. A second call with
     the same file and arguments opens the folder.
@@ -93,8 +92,8 @@ def load_robomimic(
         observed ("before" or "after", optional): whether row ``t`` of ``obs`` is the
             state before or after action ``t``. ``"after"``: the first action of each
             demonstration has no observation, and is left out. Defaults to ``None``:
-            ``"after"`` for files with the attribute ``bddl_file_name``, which LIBERO
-            writes so, else ``"before"``, as robomimic writes them.
+            ``"after"`` for files of LIBERO, which have the attribute
+            ``bddl_file_name``, and ``"before"`` for others.
         action_bounds (tuple of sequences, optional): the lowest and the highest action,
             see :func:`~torchrl_caiac.data.action_bounds`. Defaults to ``None``: -1 and
             1 if the attribute ``env_args`` says that robosuite's controllers take

@@ -66,9 +66,9 @@ def to_minari(
     where their bounds are known.
 
     Minari stores the states of an episode once, so every next state must be the state
-    of the next row. It also wants an info for the last state, of which there is none:
-    that of the row before is repeated. Images are stored without loss. Data without
-    rewards get zeros, which a warning says.
+    of the next row. It needs an info for the last state, which transitions do not have:
+    that of the row before is repeated. Images are stored without loss. If the data have
+    no rewards, zeros are written, with a warning.
 
     Args:
         data (TensorDictBase): the transitions, ``[T]``: ``"observation"`` (a tensor or

@@ -229,19 +229,22 @@ class ResidualInfluence(MotionInfluence):
                 )
                 entities.append(entity)
         self.entities = entities.eval().requires_grad_(False)
-        left = self(rows).flatten(0, -2) > 0
+        self._log_explained(moved > 0, self(rows).flatten(0, -2) > 0)
+        return self
+
+    def _log_explained(self, moved: torch.Tensor, influenced: torch.Tensor) -> None:
+        """Logs how much of the motion, bool ``[n, N]``, is not influence."""
         for number, name in enumerate(self.layout.names):
-            moves = moved[:, number] > 0
-            share = float((moves & ~left[:, number]).sum() / moves.sum().clamp_min(1))
+            moves = moved[:, number]
+            own = moves & ~influenced[:, number]
             _logger.info(
                 "%r moves in %.1f %% of %d rows, of which its own state explains "
                 "%.1f %%",
                 name,
                 100 * float(moves.float().mean()),
                 len(moves),
-                100 * share,
+                100 * float(own.sum() / moves.sum().clamp_min(1)),
             )
-        return self
 
     def expected_change(self, state: torch.Tensor) -> torch.Tensor | float:
         """Returns what the networks predict.

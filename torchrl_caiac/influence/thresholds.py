@@ -307,12 +307,7 @@ def suggest_thresholds(
     if layout.positions:
         tolerances = position_tolerances(data[:length], layout, tolerance)
         moving = {n: t for n, t in tolerances.items() if n in names}
-        found = motion_of_rows(data, layout, sampled, moving, lookahead=lookahead)
-        shape = sampled.rows.shape
-        motion = {
-            name: without_near_rests(rows.view(shape)).flatten()
-            for name, rows in found.items()
-        }
+        motion = _motion(data, layout, sampled, moving, lookahead)
     rows = sampled.rows.reshape(-1)[used]
     own = _picked(scores, rows)
     second = None
@@ -340,6 +335,21 @@ def suggest_thresholds(
     return ThresholdSuggestions(
         thresholds, confidence, reasons, free, splits, len(rows), histograms
     )
+
+
+def _motion(
+    data: TensorDictBase,
+    layout: EntityLayout,
+    sampled: SampledRows,
+    tolerances: dict[str, torch.Tensor],
+    lookahead: int,
+) -> dict[str, torch.Tensor]:
+    """Returns how each entity moves in the sampled rows, ``[K * B]``."""
+    found = motion_of_rows(data, layout, sampled, tolerances, lookahead=lookahead)
+    return {
+        name: without_near_rests(motion.view(sampled.rows.shape)).flatten()
+        for name, motion in found.items()
+    }
 
 
 # --- arguments -----------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,10 +24,10 @@ from torchrl_caiac.report.panels import (
     score_panels,
 )
 from torchrl_caiac.report.pictures import RenderFn
-from torchrl_caiac.report.places import entity_places
+from torchrl_caiac.report.places import Place, entity_places
 from torchrl_caiac.report.problems import Problem, find_problems
 from torchrl_caiac.report.settings import Entity, ReportSettings
-from torchrl_caiac.report.shares import entity_shares
+from torchrl_caiac.report.shares import EntityShares, entity_shares
 from torchrl_caiac.report.swaps import (
     PairCoverage,
     SampledSwaps,
@@ -134,20 +134,7 @@ def collect_contents(
     influenced = ~scored.is_free
     shares = entity_shares(influenced, index, settings.windows)
     places = entity_places(layout, data)
-    entities = [
-        Entity(
-            name=name,
-            fixed=name in layout.fixed,
-            features=_features(layout, name),
-            places=places[name].text if places[name].known else "",
-            floor=_floor(layout, name),
-            threshold=None if name in layout.fixed else scored.thresholds[name],
-            confidence=scored.confidence.get(name, ""),
-            reason=scored.reasons.get(name, ""),
-            shares=shares[i],
-        )
-        for i, name in enumerate(layout.names)
-    ]
+    entities = _entities(scored, places, shares)
     check = check_dataset(
         data,
         layout,
@@ -198,6 +185,26 @@ def collect_contents(
         examples=examples,
         rendered=rendered,
     )
+
+
+def _entities(
+    scored: ScoredDataset, places: Mapping[str, Place], shares: Sequence[EntityShares]
+) -> list[Entity]:
+    layout = scored.layout
+    return [
+        Entity(
+            name=name,
+            fixed=name in layout.fixed,
+            features=_features(layout, name),
+            places=places[name].text if places[name].known else "",
+            floor=_floor(layout, name),
+            threshold=None if name in layout.fixed else scored.thresholds[name],
+            confidence=scored.confidence.get(name, ""),
+            reason=scored.reasons.get(name, ""),
+            shares=shares[i],
+        )
+        for i, name in enumerate(layout.names)
+    ]
 
 
 def _complete_scores(scored: ScoredDataset) -> torch.Tensor:

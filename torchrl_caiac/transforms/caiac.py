@@ -50,11 +50,11 @@ class CAIACTransform(CounterfactualTransform):
 
     A score that :func:`~torchrl_caiac.influence.score_buffer` wrote is used only for
     the state that it was computed from: it has a fingerprint of the state and the next
-    state, which is compared in every batch. Rows that were written later, by whatever
+    state, which is compared in every batch. Rows that were written later, by any
     process, raise an error (see ``unscored``) until ``score_buffer`` is called again.
-    So append this transform before others that change the state. Scores that you wrote
-    yourself, without fingerprints, are used as they are: whoever writes other rows over
-    them must write their scores too.
+    Append this transform before others that change the state. Scores that you wrote
+    yourself, without fingerprints, are used as they are: if you overwrite rows, write
+    their scores too.
 
     Args:
         layout (EntityLayout): the entities; ``fixed`` ones are never swapped.
