@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_caiac.data.join_columns import column_ranges, join_columns
+from torchrl_caiac.data.join_columns import join_columns, joined_columns
 
 
 @given(
@@ -18,7 +18,7 @@ def test_the_ranges_find_each_array_again(widths, length):
     random = np.random.default_rng(0)
     shapes = [(length,) if width is None else (length, width) for width in widths]
     parts = {str(n): random.normal(size=shape) for n, shape in enumerate(shapes)}
-    joined, ranges = join_columns(parts, "one"), column_ranges(parts)
+    joined, ranges = join_columns(parts, "one"), joined_columns(parts)
     assert joined.shape == (length, sum(1 if w is None else w for w in widths))
     for name, (first, stop) in ranges.items():
         assert np.array_equal(joined[:, first:stop].ravel(), parts[name].ravel())

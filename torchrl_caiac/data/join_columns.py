@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["column_ranges", "join_columns"]
+__all__ = ["columns_text", "join_columns", "joined_columns"]
 
 
 def join_columns(parts: Mapping[str, Any], where: str) -> NDArray[Any]:
@@ -54,7 +54,7 @@ def join_columns(parts: Mapping[str, Any], where: str) -> NDArray[Any]:
     return np.concatenate(columns, axis=1)
 
 
-def column_ranges(parts: Mapping[str, Any]) -> dict[str, list[int]]:
+def joined_columns(parts: Mapping[str, Any]) -> dict[str, list[int]]:
     """Returns the columns of each array after :func:`join_columns`.
 
     Args:
@@ -65,8 +65,8 @@ def column_ranges(parts: Mapping[str, Any]) -> dict[str, list[int]]:
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_caiac.data.join_columns import column_ranges
-        >>> column_ranges({"arm": np.zeros((3, 2)), "time": np.arange(3.0)})
+        >>> from torchrl_caiac.data.join_columns import joined_columns
+        >>> joined_columns({"arm": np.zeros((3, 2)), "time": np.arange(3.0)})
         {'arm': [0, 2], 'time': [2, 3]}
     """
     ranges, first = {}, 0
@@ -75,3 +75,20 @@ def column_ranges(parts: Mapping[str, Any]) -> dict[str, list[int]]:
         ranges[name] = [first, first + width]
         first += width
     return ranges
+
+
+def columns_text(columns: Mapping[str, list[int]]) -> str:
+    """Returns the columns of joined arrays as text, for the log.
+
+    Args:
+        columns (mapping of str to list of int): from :func:`joined_columns`.
+
+    Returns:
+        str: the text.
+
+    Examples:
+        >>> from torchrl_caiac.data.join_columns import columns_text
+        >>> columns_text({"arm": [0, 2], "time": [2, 3]})
+        'arm 0 to 1, time 2 to 2'
+    """
+    return ", ".join(f"{key} {a} to {b - 1}" for key, (a, b) in columns.items())

@@ -16,7 +16,7 @@ from tensordict import TensorDict
 
 from torchrl_caiac.data.digests import data_source, file_digest
 from torchrl_caiac.data.episodes import episode_transitions
-from torchrl_caiac.data.join_columns import column_ranges, join_columns
+from torchrl_caiac.data.join_columns import columns_text, join_columns, joined_columns
 from torchrl_caiac.data.lerobot_files import (
     LeRobotDescription,
     describe_lerobot,
@@ -306,11 +306,10 @@ def _announce(
     if not names.is_flat:
         return None
     shapes = description.shapes
-    columns = column_ranges(
+    columns = joined_columns(
         {key: np.empty((0, *shapes[key])) for key in names.observations}
     )
-    text = ", ".join(f"{key} {a} to {b - 1}" for key, (a, b) in columns.items())
-    _logger.info("the columns of the observation: %s", text)
+    _logger.info("the columns of the observation: %s", columns_text(columns))
     return columns
 
 

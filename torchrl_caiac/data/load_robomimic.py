@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torchrl_caiac.data.digests import file_digest
 from torchrl_caiac.data.episodes import episode_transitions
 from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
-from torchrl_caiac.data.join_columns import column_ranges, join_columns
+from torchrl_caiac.data.join_columns import columns_text, join_columns, joined_columns
 from torchrl_caiac.data.minari_checks import check_hdf5_group
 from torchrl_caiac.data.robomimic_settings import (
     controller_bounds,
@@ -249,9 +249,10 @@ def _announce(demo: Any, where: str, options: _Options) -> dict[str, list[int]] 
             "" if options.is_after else "next ",
         )
     if options.keys is not None:
-        columns = column_ranges(_selected(observations, options, where))
-        text = ", ".join(f"{key} {a} to {b - 1}" for key, (a, b) in columns.items())
-        _logger.info("the columns of the observation of %s: %s", where, text)
+        columns = joined_columns(_selected(observations, options, where))
+        _logger.info(
+            "the columns of the observation of %s: %s", where, columns_text(columns)
+        )
         return columns
     left_out = [name for name in _images(observations) if name not in options.images]
     if left_out:
