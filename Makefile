@@ -3,6 +3,8 @@ PYTHON ?= python3
 WORKERS ?= 2
 DEVICE ?= cpu
 SIZE := $(if $(QUICK),size=quick)
+BROWSER := $(or $(CHROMIUM),$(firstword $(shell \
+    command -v chromium chromium-browser google-chrome google-chrome-stable)))
 INFLUENCE ?= $(if $(QUICK),outputs/influence_quick,docs/results)
 
 VENV := .venv
@@ -46,7 +48,10 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $(STAMP)
 
 test: setup ## run all tests and the docstrings' examples
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
+	$(if $(BROWSER),,@echo "no Chromium was found: 'make test' leaves out the tests" \
+	    "that look at reports in a browser (apt-get install chromium)" >&2)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) \
+	    $(if $(BROWSER),,-m 'not browser')
 
 lint: setup ## check style, formatting, spelling and types
 	$(BIN)/python -m ruff check .

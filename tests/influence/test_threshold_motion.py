@@ -13,6 +13,7 @@ from torchrl_caiac.influence.threshold_motion import (
     motion_of_rows,
     position_tolerances,
     sample_rows,
+    without_near_rests,
 )
 
 LAYOUT = EntityLayout(
@@ -132,6 +133,23 @@ def test_tolerances_are_measured_where_the_layout_has_none() -> None:
     sampled = sample_rows(td, 2000, lookahead=0, max_rows=9000, **KEYS)
     found = motion_of_rows(td, layout, sampled, {"cup": tolerance.view(1)})["cup"]
     assert torch.equal(found == 1, torch.arange(2000) % 5 == 0)
+
+
+@given(st.lists(st.sampled_from([0, 0, 0, 0, 0, 0, 1, -1]), min_size=1, max_size=60))
+def test_rests_near_motion_are_left_out(values: list[int]) -> None:
+    expected = [
+        -1
+        if own == 0 and any(near != 0 for near in values[max(i - 3, 0) : i + 4])
+        else own
+        for i, own in enumerate(values)
+    ]
+    if 2 * expected.count(0) < values.count(0):
+        expected = values
+    motion = torch.tensor([values, [0] * len(values)], dtype=torch.int8)
+    left = without_near_rests(motion[:1])
+    assert left.tolist() == [expected]
+    # blocks do not touch
+    assert without_near_rests(motion)[1].tolist() == [0] * len(values)
 
 
 def test_no_positions_say_nothing() -> None:

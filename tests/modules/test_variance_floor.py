@@ -75,6 +75,30 @@ def test_the_floor_is_that_of_the_predicted_columns(
     torch.testing.assert_close(model.target_scale, scale)
 
 
+@pytest.mark.parametrize("is_flat", [True, False])
+def test_the_positions_of_an_entity_share_the_largest_floor(is_flat: bool) -> None:
+    td = transitions()
+    td["next", "observation"][:, 4] = td["observation"][:, 4]  # hardly moves
+    td["next", "observation"][:3, 4] += 1e-4
+    noise = resting_noise(td, LAYOUT)
+    if is_flat:
+        layout = EntityLayout(LAYOUT.columns, positions={"cup": [4, 2], "arm": [0, 1]})
+        model = GaussianWorldModel(layout, 2, (8,), variance_floor="auto")
+        model.fit_variance_floor(td)
+    else:
+        layout = EntityLayout.from_keys(
+            NESTED.keys, positions={"cup": [1, 0], "arm": [1, 2]}
+        )
+        widths = {"arm": 3, "cup": 2}
+        model = GaussianWorldModel(
+            layout, 2, (8,), widths=widths, variance_floor="auto"
+        )
+        model.fit_variance_floor(nested(td))
+    arm, cup = model.entity_floors().values()
+    assert cup[0] == cup[1] > 100 * min(noise["cup"].floor)
+    assert arm[1] == arm[2]
+
+
 def _states(layout: EntityLayout, td: TensorDict) -> tuple[torch.Tensor, torch.Tensor]:
     return layout.read(td), layout.read(td, next=True)
 

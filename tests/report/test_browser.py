@@ -19,6 +19,8 @@ from tests.report.test_write_report import report
 from tests.report.walks import scored_dataset, transitions
 from torchrl_caiac import EntityLayout
 
+pytestmark = pytest.mark.browser
+
 PROBE = """
 <script>
 const scale = (m) => Math.sqrt(Math.abs(m.a * m.d - m.b * m.c));  // also if turned

@@ -256,7 +256,7 @@ def test_auto_in_an_ensemble_is_refused(where: str) -> None:
     # which samples the storages of its buffers itself
     members = [buffer(rows()), buffer(rows())]
     ensemble = ReplayBufferEnsemble(*members, batch_size=8)
-    owner = ensemble if where == "ensemble" else members[0]
-    owner.append_transform(CAIACTransform(LAYOUT, "auto"))
+    for owner in [ensemble] if where == "ensemble" else members:
+        owner.append_transform(CAIACTransform(LAYOUT, "auto"))
     with pytest.raises(RuntimeError, match="StorageEnsemble: pass numbers"):
         ensemble.sample()

@@ -14,11 +14,19 @@ from torchrl_caiac.influence.threshold_rule import MOVES, RESTS
 from torchrl_caiac.noise import resting_noise
 from torchrl_caiac.trajectories import trajectory_index
 
-__all__ = ["SampledRows", "motion_of_rows", "position_tolerances", "sample_rows"]
+__all__ = [
+    "SampledRows",
+    "motion_of_rows",
+    "position_tolerances",
+    "sample_rows",
+    "without_near_rests",
+]
 
 # A change above this multiple of the tolerance is motion, one up to it is rest.
 _CLEAR = 3.0
 _NEITHER = -1
+# Rows at rest this near a row that is not: the entity is likely to be in reach.
+_NEAR = 3
 _BLOCK = 1000  # successive rows that are sampled together
 _CHUNK = 20_000  # rows that are read together
 
@@ -192,6 +200,36 @@ def motion_of_rows(
     motion[(changes <= 1) & is_whole.unsqueeze(-1)] = RESTS
     motion[changes > _CLEAR] = MOVES
     return dict(zip(tolerances, motion.flatten(0, 1).unbind(-1), strict=True))
+
+
+def without_near_rests(motion: torch.Tensor) -> torch.Tensor:
+    """Returns motion without the rows at rest just before or after motion.
+
+    There the agent is often about to move the entity, or has just let it go: it could
+    be moved by another action, although it rests.
+
+    Args:
+        motion (torch.Tensor): of one entity, int8 ``[K, B]``, successive rows.
+
+    Returns:
+        torch.Tensor: int8 ``[K, B]``. Rows at rest up to three rows from one that does
+        not rest are neither; all are kept if only less than half of them are left.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.influence.threshold_motion import without_near_rests
+        >>> without_near_rests(torch.tensor([[0, 0, 0, 0, 0, 0, 0, 0, 0, 1]]).char())
+        tensor([[ 0,  0,  0,  0,  0,  0, -1, -1, -1,  1]], dtype=torch.int8)
+    """
+    rests = motion == RESTS
+    is_near = ~rests
+    for step in range(1, min(_NEAR + 1, motion.shape[1])):
+        is_near[:, :-step] |= ~rests[:, step:]
+        is_near[:, step:] |= ~rests[:, :-step]
+    left = rests & ~is_near
+    if 2 * int(left.sum()) < int(rests.sum()):
+        return motion
+    return motion.masked_fill(rests & is_near, _NEITHER)
 
 
 def _changes(

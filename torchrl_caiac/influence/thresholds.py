@@ -28,6 +28,7 @@ from torchrl_caiac.influence.threshold_motion import (
     motion_of_rows,
     position_tolerances,
     sample_rows,
+    without_near_rests,
 )
 from torchrl_caiac.influence.threshold_rule import (
     DEFAULT_THRESHOLD,
@@ -220,10 +221,12 @@ def suggest_thresholds(
     The scores of an entity are split where their logarithms fall into two groups
     (Otsu). If the layout has ``positions``, the split is compared with what moves in
     the recorded transitions: rows in which the entity moves must score above rows in
-    which it rests. The split is kept if it tells both apart almost as well as possible,
-    and else moved to the nearest threshold that does. An entity that never moves counts
-    as never influenced. Where this is not clear, such as for an estimator that misses
-    influence or for entities that move by themselves, the entity is never swapped.
+    which it rests (apart from those just before and after motion, in which the agent
+    may be able to move it). The split is kept if it tells both apart almost as well as
+    possible, and else moved to the nearest threshold that does. An entity that never
+    moves counts as never influenced. Where this is not clear, such as for an estimator
+    that misses influence or for entities that move by themselves, the entity is never
+    swapped.
 
     Without positions the scores alone must have two modes far apart.
 
@@ -304,7 +307,12 @@ def suggest_thresholds(
     if layout.positions:
         tolerances = position_tolerances(data[:length], layout, tolerance)
         moving = {n: t for n, t in tolerances.items() if n in names}
-        motion = motion_of_rows(data, layout, sampled, moving, lookahead=lookahead)
+        found = motion_of_rows(data, layout, sampled, moving, lookahead=lookahead)
+        shape = sampled.rows.shape
+        motion = {
+            name: without_near_rests(rows.view(shape)).flatten()
+            for name, rows in found.items()
+        }
     rows = sampled.rows.reshape(-1)[used]
     own = _picked(scores, rows)
     second = None

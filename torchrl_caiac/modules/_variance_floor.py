@@ -56,9 +56,11 @@ class FloorFromData(nn.Module):
     ) -> None:
         """Sets the variance floor from the noise of the entities while they rest.
 
-        See :func:`~torchrl_caiac.noise.resting_noise`. With ``variance_floor="auto"``,
-        :meth:`fit_statistics` and :func:`~torchrl_caiac.fit.fit_world_model` call it.
-        The reasons are logged and kept in :attr:`floor_reasons`.
+        See :func:`~torchrl_caiac.noise.resting_noise`. The columns of
+        ``layout.positions`` of an entity share one floor, the largest of theirs. With
+        ``variance_floor="auto"``, :meth:`fit_statistics` and
+        :func:`~torchrl_caiac.fit.fit_world_model` call it. The reasons are logged and
+        kept in :attr:`floor_reasons`.
 
         Args:
             data (TensorDictBase or sequence of them): transitions ``[T]``, of which up
@@ -95,7 +97,14 @@ class FloorFromData(nn.Module):
                 "variance_floor='auto' to take the floor from data"
             )
         noise = resting_noise(_state_sample(self.layout, data), self.layout)
-        floor = [noise[n].floor[p] for n, own in self.predict.items() for p in own]
+        floor: list[float] = []
+        for name, own in self.predict.items():
+            each = list(noise[name].floor)
+            places = _position_places(self.layout, name)
+            # An object that is pushed hardly moves in height, but not more exactly.
+            for place in places:
+                each[place] = max(noise[name].floor[p] for p in places)
+            floor += [each[p] for p in own]
         self.floor.copy_(torch.tensor(floor, dtype=torch.float64))
         self.floor_reasons = {name: noise[name].reason for name in self.predicted}
         for name, where in self.predicted.items():
@@ -190,6 +199,14 @@ def checked_floor(
             )
         floors += [float(v) for v in values]
     return floors
+
+
+def _position_places(layout: EntityLayout, name: str) -> list[int]:
+    """Returns the places of an entity's positions in its features, if known."""
+    positions = layout.positions.get(name, ())
+    if not layout.is_flat:
+        return list(positions)
+    return [layout.columns[name].index(column) for column in positions]
 
 
 def _is_deviation(value: Any) -> bool:

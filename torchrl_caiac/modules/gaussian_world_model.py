@@ -99,9 +99,8 @@ class GaussianWorldModel(EntityDynamicsModel):
             ``200.0``.
         inputs (Mapping of str to iterable of int, optional): the columns of some
             entities that the model reads, as in
-            :class:`~torchrl_caiac.modules.EntityDynamicsModel`. A column that does not
-            help to predict, such as a joint angle next to the position of the hand, is
-            one more way to memorise the data. Defaults to all columns.
+            :class:`~torchrl_caiac.modules.EntityDynamicsModel`. Defaults to all
+            columns; see :func:`~torchrl_caiac.influence.default_world_model`.
 
     Attributes:
         predicted (dict of str to slice): the position of each predicted entity in
