@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("--play", type=Path, nargs="*", help="files to learn from")
     parser.add_argument("--held-out", type=Path, help="a file of other episodes")
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--states", type=int, default=2500, help="of the truth")
+    parser.add_argument("--states", type=int, default=1500, help="of the truth")
     parser.add_argument("--steps", type=int, default=15_000, help="of the world model")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

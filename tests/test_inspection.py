@@ -113,9 +113,13 @@ def test_values_that_are_not_finite_are_counted() -> None:
     data = push_transitions()
     data["action"][3] = float("nan")
     data["next", "observation"][5, 2] = float("inf")
+    data["observation"][:, 5] = float("nan")
+    data["observation"][7, 4] = float("nan")
     found = inspect_dataset(data)
     bad = {leaf.key: leaf.not_finite for leaf in found.leaves if leaf.not_finite}
-    assert bad == {"action": 1, ("next", "observation"): 1}
+    assert bad == {"action": 1, "observation": 241, ("next", "observation"): 1}
+    assert (found.columns[5].low, found.columns[5].high) == (None, None)
+    assert found.columns[4].high == push_transitions()["observation"][:, 4].max()
     assert "1 values are not finite" in str(found)
     json.dumps(found.to_dict(), allow_nan=False)
 

@@ -67,8 +67,8 @@ class ColumnFacts:
 
     Args:
         column (int): its number; in a nested observation, its place in the leaf.
-        low (float): the lowest value.
-        high (float): the highest value.
+        low (float, optional): the lowest value; ``None`` if none is finite.
+        high (float, optional): the highest value.
         moves (float): the share of rows in which it moves: changes by more than a
             thousandth of its range.
         step (float): the median size of a change when it moves, in the data's units.
@@ -83,8 +83,8 @@ class ColumnFacts:
     """
 
     column: int
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     moves: float
     step: float
     explained: float
@@ -357,7 +357,9 @@ class _Columns:
         now = self._read(data, key, rows)
         change = self._read(data, next_key, rows) - now
         change = torch.nan_to_num(change, 0.0, 0.0, 0.0)
-        self.low, self.high = now.amin(0), now.amax(0)
+        known = now.isfinite()
+        self.low = torch.where(known, now, math.inf).amin(0)
+        self.high = torch.where(known, now, -math.inf).amax(0)
         span = torch.nan_to_num(self.high - self.low, 0.0, 0.0, 0.0)
         size = change.abs()
         # What is far smaller than everything else is jitter, not motion.
@@ -384,8 +386,8 @@ class _Columns:
     def facts(self) -> list[ColumnFacts]:
         """Returns the facts of all columns."""
         table = zip(
-            self.low.tolist(),
-            self.high.tolist(),
+            [low if math.isfinite(low) else None for low in self.low.tolist()],
+            [high if math.isfinite(high) else None for high in self.high.tolist()],
             self.moves.tolist(),
             self.step.tolist(),
             self.explained.tolist(),

@@ -10,6 +10,7 @@ from tests.cli.conftest import Caiac
 from tests.pushes import LAYOUT, push_transitions
 from torchrl_caiac import EntityLayout, check_dataset
 from torchrl_caiac.data import load_transitions, write_transitions
+from torchrl_caiac.layouts import layout_notes
 
 
 def test_data_without_errors(caiac: Caiac, pushes: Path) -> None:
@@ -62,3 +63,9 @@ def test_a_layout_that_is_cut_short(caiac: Caiac, pushes: Path) -> None:
     result = caiac("check", pushes, "--layout", "layout.json")
     assert result.code == 1
     assert "layout.json is not a readable layout" in result.error
+
+
+def test_the_notes_of_a_ready_layout_are_shown(caiac: Caiac, pushes: Path) -> None:
+    result = caiac("check", pushes, "--layout", "fetch/push")
+    note = f"layout fetch/push: {layout_notes('fetch/push')}"
+    assert note in result.err and "belong to no entity" in note

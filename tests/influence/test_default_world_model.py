@@ -8,7 +8,8 @@ from tensordict import TensorDict
 
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.fit import fit_world_model
-from torchrl_caiac.influence import CAI, DEFAULT_FIT, default_world_model, roc_auc
+from torchrl_caiac.influence import CAI, default_world_model, roc_auc
+from torchrl_caiac.influence.default_world_model import DEFAULT_FIT
 from torchrl_caiac.layouts import ready_layout
 
 

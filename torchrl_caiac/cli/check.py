@@ -40,7 +40,7 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Runs the command."""
-    layout = read_layout(args.layout)
+    layout = read_layout(args.layout, console)
     data = open_data(args, console)
     with console.step("checking"):
         report = check_dataset(

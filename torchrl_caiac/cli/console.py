@@ -101,7 +101,8 @@ class Console:
     def document(self, value: Any) -> None:
         """Writes the result as JSON, if JSON was asked for."""
         if self.as_json:
-            self._write(self._out, json.dumps(plain(value), indent=1) + "\n")
+            text = json.dumps(plain(value), indent=1, allow_nan=False)
+            self._write(self._out, f"{text}\n")
 
     def note(self, text: str) -> None:
         """Writes a line about what is done to the standard error."""

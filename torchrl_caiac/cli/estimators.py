@@ -19,13 +19,13 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import (
     CAI,
-    DEFAULT_FIT,
     AttentionInfluence,
     DistanceInfluence,
     MotionInfluence,
     ResidualInfluence,
     default_world_model,
 )
+from torchrl_caiac.influence.default_world_model import DEFAULT_FIT
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 from torchrl_caiac.scored import MODEL_FOLDER

@@ -91,7 +91,7 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Runs the command."""
-    layout = read_layout(args.layout)
+    layout = read_layout(args.layout, console)
     for name, least in (("lookahead", 0), ("smoothing", 1)):
         if getattr(args, name) < least:
             raise UsageError(f"--{name} must be at least {least}")

@@ -106,11 +106,12 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def read_layout(name: str) -> EntityLayout:
+def read_layout(name: str, console: Console) -> EntityLayout:
     """Returns the layout that an argument names.
 
     Args:
-        name (str): a file, or the name of a ready layout.
+        name (str): a file, or the name of a ready layout, whose notes are shown.
+        console (Console): where they are shown.
 
     Returns:
         EntityLayout: the layout.
@@ -127,7 +128,7 @@ def read_layout(name: str) -> EntityLayout:
                 "--write-layout FILE` writes a proposal"
             )
         return EntityLayout.load(name)
-    from torchrl_caiac.layouts import layout_names, ready_layout
+    from torchrl_caiac.layouts import layout_names, layout_notes, ready_layout
 
     names = layout_names()
     if name not in names:
@@ -137,6 +138,8 @@ def read_layout(name: str) -> EntityLayout:
             f"there is no layout {name!r}: {hint}The ready layouts are "
             f"{', '.join(names)}; or give a .json or .yaml file"
         )
+    if layout_notes(name):
+        console.note(f"layout {name}: {layout_notes(name)}")
     return ready_layout(name)
 
 

@@ -6,7 +6,6 @@ from torchrl_caiac.influence.action_coverage import ActionCoverage, action_cover
 from torchrl_caiac.influence.attention import AttentionInfluence
 from torchrl_caiac.influence.cai import CAI
 from torchrl_caiac.influence.default_world_model import (
-    DEFAULT_FIT,
     default_world_model,
 )
 from torchrl_caiac.influence.distance import DistanceInfluence
@@ -35,7 +34,6 @@ from torchrl_caiac.influence.truth import (
 
 __all__ = [
     "CAI",
-    "DEFAULT_FIT",
     "ActionCoverage",
     "AttentionInfluence",
     "DistanceInfluence",

@@ -141,6 +141,11 @@ def _frames(
         )
         frames = np.asarray(found(states))
     except (ImportError, RuntimeError) as error:
+        if render == "auto" and isinstance(error, ModuleNotFoundError):
+            return None, (
+                f"the package {error.name!r} is not installed (pip install "
+                "'torchrl-caiac[envs]', for OGBench 'torchrl-caiac[ogbench]')"
+            )
         if render == "auto" and _is_unavailable(error):
             return None, str(error)
         raise

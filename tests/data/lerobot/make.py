@@ -1,13 +1,13 @@
 """Writes the LeRobot datasets beside this file with LeRobot's own writer.
 
 It was run in two environments of their own, because LeRobot needs other versions of
-torch than this project (neither reads nor writes images here, so torchvision may be a
-stub):
+torch, NumPy and pandas than this project. It needs no images here, so an empty module
+in the place of torchvision is enough.
 
-    pip install lerobot==0.3.3    # codebase v2.1
+    pip install lerobot==0.3.3 "numpy<2.3" "pandas<3"    # codebase v2.1
     python tests/data/lerobot/make.py tests/data/lerobot/v2.1
 
-    pip install lerobot==0.4.4    # codebase v3.0
+    pip install lerobot==0.4.4 "numpy<2.3" "pandas<3"    # codebase v3.0
     python tests/data/lerobot/make.py tests/data/lerobot/v3.0
 
 The numbers follow :func:`episode`, which the tests read too.
