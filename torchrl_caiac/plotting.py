@@ -6,6 +6,7 @@ is needed and no figure has to be closed. Matplotlib and SciPy are imported on u
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -311,10 +312,10 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 place + (n - (len(estimators) - 1) / 2) * width,
                 height,
                 0.9 * width,
-                color=colour(n),
+                **_fill(n),
             )
         axes.set_title(title, fontsize=9)
-        labels = [name_label(e) for e in experiments]
+        labels = [textwrap.fill(name_label(e), 10) for e in experiments]
         axes.set_xticks(range(len(experiments)), labels, fontsize=8)
         if kind == "log" and axes.patches:
             axes.set_yscale("log")
@@ -325,13 +326,20 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
     figure.legend(
         handles=[
-            Patch(color=colour(n), label=name_label(name))
+            Patch(**_fill(n), label=name_label(name))
             for n, name in enumerate(estimators)
         ],
         loc="lower right",
         frameon=False,
     )
     return figure
+
+
+def _fill(number: int) -> dict[str, Any]:
+    """Returns the look of a bar; hatched where the colours repeat."""
+    if number < NUM_COLOURS:
+        return {"color": colour(number)}
+    return {"facecolor": colour(number), "edgecolor": "white", "hatch": "////"}
 
 
 def plot_success(
