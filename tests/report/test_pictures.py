@@ -139,7 +139,7 @@ def test_render_function(walks, tmp_path) -> None:
     text = report(walks, tmp_path, render=render, examples=2)
     page = check_page(text)
     assert text.count('src="data:image/jpeg;base64,') == 4
-    assert "Left a recorded state, right what" in page.text
+    assert "Left, a recorded state. Right, its counterfactual" in page.text
 
     for wrong, message in (
         (lambda states: render(states)[1:], "returned 3 frames for 4 states"),
