@@ -67,6 +67,23 @@ def test_an_entity_that_always_moves_counts_as_moving() -> None:
     assert found.floor[0] == pytest.approx(0.067, abs=0.005)  # a tenth of the median
 
 
+@pytest.mark.parametrize("noise", [0.0, 2e-5])
+@pytest.mark.parametrize("slow", [0.05, 0.2, 0.3])
+def test_slow_motion_is_seen_beside_fast_motion(noise: float, slow: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.randn(2, ROWS, 1, generator=generator)
+    draw = torch.rand(ROWS, 1, generator=generator)
+    is_slow, is_fast = draw < slow, draw > 0.95
+    change = noise * normal[0] + (1 + 0.2 * normal[1]) * (
+        0.002 * is_slow + 0.05 * is_fast
+    )
+    found = resting_noise(transitions(change), EntityLayout({"cup": [0]}))["cup"]
+    moves = change.abs() > found.tolerance[0]
+    assert float(moves[is_slow].double().mean()) > 0.85
+    assert float(moves[~(is_slow | is_fast)].double().mean()) < 0.01
+    assert moves[is_fast].all()
+
+
 def test_the_tolerance_covers_the_noise() -> None:
     generator = torch.Generator().manual_seed(0)
     normal = torch.randn(2, ROWS, 1, generator=generator)

@@ -16,10 +16,14 @@ from torchrl_caiac.entities import EntityLayout
 
 __all__ = ["EntityNoise", "resting_noise", "sample_rows"]
 
-_SHARE = 0.1  # of the median change while it moves: smaller changes do not matter
+# Of the median change while it moves: smaller changes do not matter to a model, and
+# much smaller ones are no motion.
+_SHARE, _LEAST = 0.1, 0.02
 _DEVIATIONS = 4.0  # of the noise: larger changes are motion
 _LARGE = 0.999  # the quantile of the changes that stands for fast motion
-_STILL = 1e-2  # of fast motion: an entity that changes less rests
+# Of fast motion: differences between smaller changes do not matter, at first, and then
+# among the rows that seem to rest, in which much slower motion may hide.
+_STILL = (1e-2, 1e-3)
 _BINS = 120
 _SPREAD = 0.1  # decades: the smallest deviation of a mode
 # Nats for each row of the smaller mode, by which two modes must explain the data better
@@ -38,8 +42,8 @@ class EntityNoise:
         tolerance (tuple of float): for each feature the largest change that is noise.
         noise (tuple of float): the root mean square of the changes while it rests,
             without the largest 1 %; NaN if it never rests.
-        moving (tuple of float): the median size of the changes while it moves, NaN if
-            it never moves.
+        moving (tuple of float): the median size of the changes while it clearly moves,
+            NaN if it never moves.
         rest_share (float): the share of the rows in which it rests.
         reason (str): how the floor was found.
     """
@@ -66,10 +70,13 @@ def resting_noise(
     are those of ``layout.positions`` if they are known, else of all columns, each
     divided by its 99.9 % quantile.
 
+    The rows that seem to rest are split once more, because slow motion hides beside
+    fast motion.
+
     The floor of a column is the largest of three numbers: the noise at rest, a tenth of
-    the median change while the entity moves, and the resolution of the numbers.
-    The tolerance is the same with four times the noise, and at least the 99.9 %
-    quantile of the changes at rest.
+    the median change while the entity moves, and the resolution of the numbers. The
+    tolerance is the largest of four times the noise, the 99.9 % quantile of the changes
+    at rest, a fiftieth of the median change while the entity moves, and the resolution.
 
     Args:
         data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
@@ -186,20 +193,24 @@ def _entity(
         reason = f"never moves in {count} rows"
     else:
         size = (change[:, tell] / large[tell]).amax(1)
-        split = _split((size + _STILL).log10())
-        if split is None:
-            rests = (change[:, tell] <= resolution[tell]).all(1)
-        else:
-            rests = size <= 10.0**split - _STILL
+        rests = (change[:, tell] <= resolution[tell]).all(1)
+        limit, moves = math.inf, ~rests
+        for still in _STILL:
+            split = _split((size[size <= limit] + still).log10())
+            if split is None:
+                continue
+            if limit == math.inf:
+                moves = size > 10.0**split - still
+            limit = 10.0**split - still
+            rests = size <= limit
         noise = _typical(change[rests]) if bool(rests.any()) else nan
-        moves = change[~rests]
-        moving = torch.where(varies, moves.median(0).values, nan)
+        moving = torch.where(varies, change[moves].median(0).values, nan)
         reason = ""
     zero = torch.zeros_like(nan)
-    part = _SHARE * torch.where(moving.isnan(), zero, moving)
+    motion = torch.where(moving.isnan(), zero, moving)
     quiet = torch.where(noise.isnan(), zero, noise)
-    least = torch.maximum(part, resolution)
-    floor = torch.maximum(quiet, least)
+    floor = torch.maximum(quiet, torch.maximum(_SHARE * motion, resolution))
+    least = torch.maximum(_LEAST * motion, resolution)
     tolerance = torch.maximum(_DEVIATIONS * quiet, least)
     if bool(rests.any()):
         at_rest = torch.stack([_quantile(c, _LARGE) for c in change[rests].T])
