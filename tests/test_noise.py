@@ -84,6 +84,24 @@ def test_slow_motion_is_seen_beside_fast_motion(noise: float, slow: float) -> No
     assert moves[is_fast].all()
 
 
+def test_jitter_is_no_motion_beside_an_entity_that_moves() -> None:
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.randn(2, ROWS, 1, generator=generator)
+    change = torch.cat([0.05 * normal[0], 1e-6 * normal[1]], 1)
+    columns = {"arm": [0], "door": [1]}
+    alone = resting_noise(transitions(change), EntityLayout(columns))["door"]
+    assert alone.floor[0] < 1e-5
+    layout = EntityLayout(columns, positions=columns)
+    found = resting_noise(transitions(change), layout)
+    assert found["door"].floor[0] == pytest.approx(0.01 * found["arm"].moving[0])
+    assert found["door"].tolerance[0] == pytest.approx(0.002 * found["arm"].moving[0])
+    assert found["door"].reason.endswith("a hundredth of the median change of 'arm'")
+    assert (
+        found["arm"].floor
+        == resting_noise(transitions(change), EntityLayout(columns))["arm"].floor
+    )
+
+
 def test_the_tolerance_covers_the_noise() -> None:
     generator = torch.Generator().manual_seed(0)
     normal = torch.randn(2, ROWS, 1, generator=generator)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -24,6 +24,8 @@ _LARGE = 0.999  # the quantile of the changes that stands for fast motion
 # Of fast motion: differences between smaller changes do not matter, at first, and then
 # among the rows that seem to rest, in which much slower motion may hide.
 _STILL = (1e-2, 1e-3)
+# Of the median change of the fastest entity, at least.
+_FLOOR_BESIDE, _TOLERANCE_BESIDE = 0.01, 0.002
 _BINS = 120
 _SPREAD = 0.1  # decades: the smallest deviation of a mode
 # Nats for each row of the smaller mode, by which two modes must explain the data better
@@ -77,6 +79,9 @@ def resting_noise(
     the median change while the entity moves, and the resolution of the numbers. The
     tolerance is the largest of four times the noise, the 99.9 % quantile of the changes
     at rest, a fiftieth of the median change while the entity moves, and the resolution.
+    For positions that the layout names, the floor is also at least a hundredth, and the
+    tolerance a 500th, of the median change of the fastest entity: next to it, a
+    simulator's jitter is no motion.
 
     Args:
         data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
@@ -136,7 +141,46 @@ def resting_noise(
     for name, where in layout.slices(rows).items():
         columns = position_features(layout, name, where.stop - where.start)
         result[name] = _entity(change[:, where], rounding[where], columns)
-    return result
+    return _beside_the_fastest(result, layout, layout.slices(rows))
+
+
+def _beside_the_fastest(
+    found: dict[str, EntityNoise], layout: EntityLayout, slices: dict[str, slice]
+) -> dict[str, EntityNoise]:
+    """Raises floors and tolerances that are tiny next to the motion of other entities.
+
+    A simulator's jitter is not the motion of an entity that never really moves. Only
+    positions are compared, which have similar units.
+    """
+    places = {
+        name: position_features(layout, name, slices[name].stop - slices[name].start)
+        for name in layout.positions
+    }
+    motion = {
+        name: max(
+            (found[name].moving[c] for c in own if found[name].moving[c] > 0), default=0
+        )
+        for name, own in places.items()
+    }
+    fastest = max(motion, key=lambda name: motion[name], default="")
+    for name, own in places.items():
+        noise, most = found[name], motion[fastest]
+        floor = _raised(noise.floor, own, _FLOOR_BESIDE * most)
+        tolerance = _raised(noise.tolerance, own, _TOLERANCE_BESIDE * most)
+        reason = noise.reason
+        if max(floor[c] for c in own) > max(noise.floor[c] for c in own):
+            reason += (
+                f"; raised to {_FLOOR_BESIDE * most:.3g}, a hundredth of the median "
+                f"change of {fastest!r}"
+            )
+        found[name] = replace(noise, floor=floor, tolerance=tolerance, reason=reason)
+    return found
+
+
+def _raised(
+    values: tuple[float, ...], places: list[int], least: float
+) -> tuple[float, ...]:
+    return tuple(max(v, least) if c in places else v for c, v in enumerate(values))
 
 
 def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBase:
