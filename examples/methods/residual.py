@@ -18,16 +18,20 @@ class Residual(Motion):
     Args:
         far (float, optional): the distance of the robot from which on a row shows what
             an entity does alone. Defaults to ``None``: in all rows.
+        steps (int): gradient steps. Defaults to 2000.
     """
 
     label = "CAIAC by residual"
     fits_itself = True
     score_key = ("residual", "score")
     far: float | None = None
+    steps: int = 2000
 
     def estimator(self, scoring: Scoring) -> Estimator:
         """Returns the residual, after fitting it to the rows."""
         estimator = ResidualInfluence(
             scoring.environment.layout, self.tolerance, far=self.far
         )
-        return estimator.fit(scoring.environment.rows(), progress=scoring.progress)
+        return estimator.fit(
+            scoring.environment.rows(), steps=self.steps, progress=scoring.progress
+        )
