@@ -130,6 +130,28 @@ def test_counterfactuals_alone(plain: ScoredDataset, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["transitions", "trajectories"])
+def test_ids_are_those_of_no_original(
+    plain: ScoredDataset, tmp_path: Path, kind: str
+) -> None:
+    data = plain.data.exclude("caiac").to_tensordict()
+    data["episode"] = torch.tensor([3, 9, 4, 70, -5, 8])[data["episode"]]
+    scored = score(tmp_path / "others", data, LAYOUT)
+    made = augment_dataset(scored, tmp_path / "made", kind=kind, progress=False)
+    assert torch.equal(made["episode"][:240], data["episode"])
+    new = made["episode"][240:].unique()
+    assert new.tolist() == list(range(71, 71 + len(new)))
+    assert len(trajectory_index(made).ends) == 6 + len(new)
+
+
+def test_no_room_for_more_ids(plain: ScoredDataset, tmp_path: Path) -> None:
+    data = plain.data.exclude("caiac").to_tensordict()
+    data["episode"] += 2**63 - 100
+    scored = score(tmp_path / "others", data, LAYOUT)
+    with pytest.raises(ValueError, match="no room for 240 more"):
+        augment_dataset(scored, tmp_path / "made", progress=False)
+
+
+@pytest.mark.parametrize("kind", ["transitions", "trajectories"])
 def test_goals_and_rewards_follow(
     goals: ScoredDataset, tmp_path: Path, kind: str
 ) -> None:

@@ -114,6 +114,7 @@ def augment_dataset(
             counterfactual_transitions(scored, data, rows, generator, **options)
         )
     before = len(data) if originals else 0
+    episode = _first_id(scored.data["episode"], number) if originals else 0
     bounds = action_bounds(scored.data)
     with whole_transitions(path) as folder:
         first = _flagged(data[:1].to_tensordict(), scored)
@@ -121,12 +122,14 @@ def augment_dataset(
         stored = first.expand(before + rows).memmap_like(folder)
         reserve(folder)
         _copy(data[:before], stored, scored)
-        place, episode = before, len(index.ends) if originals else 0
+        place = before
         with tqdm(total=number, disable=not progress, desc=kind, unit="") as bar:
             for part in parts:
                 part = part.select(*first.keys(True, True))
-                ids = torch.arange(len(part)) if kind == "transitions" else 0
-                part["episode"] = torch.zeros_like(part["episode"]) + episode + ids
+                ids = torch.zeros_like(part["episode"]) + episode
+                if kind == "transitions":
+                    ids += torch.arange(len(part)).reshape(ids.shape)
+                part["episode"] = ids
                 stored[place : place + len(part)].update_(part)
                 place += len(part)
                 added = len(part) if kind == "transitions" else 1
@@ -166,6 +169,22 @@ def needs_reward(scored: ScoredDataset) -> bool:
 def _count(ratio: float, originals: int) -> int:
     """Returns the number of counterfactuals, at least one."""
     return max(1, round(ratio / (1 - ratio) * originals))
+
+
+def _first_id(ids: torch.Tensor, number: int) -> int:
+    """Returns the first of ``number`` trajectory ids that the originals do not have."""
+    first = int(ids.max()) + 1
+    if ids.is_floating_point():
+        largest = int(2 / torch.finfo(ids.dtype).eps)  # the next integer is rounded
+    else:
+        largest = torch.iinfo(ids.dtype).max
+    if first + number - 1 > largest:
+        raise ValueError(
+            f"'episode' has ids up to {first - 1}, and its type {ids.dtype} has no "
+            f"room for {number} more: number the trajectories from 0, or leave out the "
+            "originals"
+        )
+    return first
 
 
 def _scores(scored: ScoredDataset) -> list[Any]:
