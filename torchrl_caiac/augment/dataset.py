@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from torchrl_caiac._files import reserve
 from torchrl_caiac._keys import path as path_of
-from torchrl_caiac.augment.rewards import find_sparse_reward
+from torchrl_caiac.augment.rewards import ends_at_goals, find_sparse_reward
 from torchrl_caiac.augment.trajectories import (
     TrajectoryPlan,
     counterfactual_trajectories,
@@ -70,9 +70,10 @@ def augment_dataset(
             ``"transitions"``.
         reward (str, optional): the rewards of counterfactuals. ``"stored"``: those of
             the original transition; ``"sparse"``: recomputed, see
-            :func:`~torchrl_caiac.augment.find_sparse_reward`. It must be given if the
-            data have rewards, and goals that the layout maps. Defaults to ``None``:
-            ``"stored"``.
+            :func:`~torchrl_caiac.augment.find_sparse_reward`. If the task ends where
+            goals are reached, ``("next", "terminated")`` is recomputed too, and
+            trajectories end there. It must be given if the data have rewards, and goals
+            that the layout maps. Defaults to ``None``: ``"stored"``.
         tolerance (float, optional): that of sparse rewards. Defaults to ``None``: found
             in the data.
         originals (bool): whether the originals are written too. Defaults to ``True``.
@@ -88,7 +89,8 @@ def augment_dataset(
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         OSError: the disk is full.
         ValueError: an argument is out of range; nothing can be swapped; the choice of
-            rewards is missing; no sparse reward agrees with the stored ones.
+            rewards is missing; no sparse reward agrees with the stored ones, or the
+            task ends in other rows than those that reach their goals.
 
     Examples:
         See :doc:`/cli`.
@@ -108,6 +110,12 @@ def augment_dataset(
         plan = TrajectoryPlan(scored, count, generator)
         rows, number = plan.rows, count
         parts = counterfactual_trajectories(plan, data, **options)
+        if "terminated_fn" in options:
+            # Only the new ends say how long the trajectories are: make them twice.
+            state = generator.get_state()
+            rows = sum(len(part) for part in _ended(parts))
+            generator.set_state(state)
+            parts = _ended(counterfactual_trajectories(plan, data, **options))
     else:
         rows = number = _count(ratio, len(data))
         parts = _single_steps(
@@ -267,4 +275,19 @@ def _rewards(
         return {}
     if not scored.layout.goal:
         raise ValueError("sparse rewards need goals, and the layout has none")
-    return {"reward_fn": find_sparse_reward(scored.data, scored.layout, tolerance)}
+    rule = find_sparse_reward(scored.data, scored.layout, tolerance)
+    if not ends_at_goals(rule, scored.data, scored.layout):
+        return {"reward_fn": rule}
+    return {"reward_fn": rule, "terminated_fn": rule.is_reached}
+
+
+def _ended(parts: Iterator[TensorDictBase]) -> Iterator[TensorDictBase]:
+    """Cuts trajectories after the first row that ends the task, and closes others."""
+    for part in parts:
+        ends = part[_KEYS.terminated].reshape(-1).nonzero()[:, 0]
+        part = part[: int(ends[0]) + 1] if len(ends) else part
+        after, last = part["next"], slice(len(part) - 1, len(part))
+        after["done"][last] = True
+        if after.get("truncated", None) is not None:
+            after["truncated"][last] = ~after["terminated"][last]
+        yield part

@@ -12,7 +12,7 @@ from torchrl_caiac._keys import get_leaf
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.rewards import goal_vectors
 
-__all__ = ["SparseReward", "find_sparse_reward"]
+__all__ = ["SparseReward", "ends_at_goals", "find_sparse_reward"]
 
 _CHUNK = 1 << 16  # rows read at a time
 _AGREE = 0.999  # share of rows in which a sparse reward must be the stored one
@@ -187,6 +187,72 @@ def find_sparse_reward(
             "rewards"
         )
     return best
+
+
+def ends_at_goals(
+    rule: SparseReward,
+    data: TensorDictBase,
+    layout: EntityLayout,
+    *,
+    terminated_key: NestedKey = ("next", "terminated"),
+) -> bool:
+    """Returns whether the task ends where goals are reached, or never.
+
+    Args:
+        rule (SparseReward): says which goals are reached.
+        data (TensorDictBase): transitions ``[T]`` with goals.
+        layout (EntityLayout): the entities, with goals.
+
+    Keyword Args:
+        terminated_key (NestedKey): whether the task ends. Defaults to ``("next",
+            "terminated")``.
+
+    Returns:
+        bool: ``True`` if it ends exactly where the goals are reached, ``False`` if it
+        never ends or the data do not say.
+
+    Raises:
+        ValueError: it ends in other rows.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.augment import SparseReward
+        >>> from torchrl_caiac.augment.rewards import ends_at_goals
+        >>> layout = EntityLayout(
+        ...     {"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]}
+        ... )
+        >>> data = TensorDict(
+        ...     {
+        ...         "desired_goal": torch.zeros(2, 1),
+        ...         "next": {
+        ...             "observation": torch.tensor([[0.0], [0.5]]),
+        ...             "terminated": torch.tensor([[True], [False]]),
+        ...         },
+        ...     },
+        ...     [2],
+        ... )
+        >>> ends_at_goals(SparseReward(((0,),), 0.1), data, layout)
+        True
+    """
+    stored = data.get(terminated_key, None)
+    if stored is None or not bool(stored.any()):
+        return False
+    ends = stored.as_subclass(torch.Tensor).flatten().bool()
+    reached = _distances(rule, data, layout) <= rule.tolerance
+    wrong = [int((ends & ~reached).sum()), int((reached & ~ends).sum())]
+    counts = [int(ends.sum()), int(reached.sum())]
+    shares = [w / max(c, 1) for w, c in zip(wrong, counts, strict=True)]
+    if max(shares) > 1 - _AGREE_EACH:
+        raise ValueError(
+            f"{terminated_key!r} does not say where goals are reached: {wrong[0]} of "
+            f"the {counts[0]} rows that end the task do not reach them, and {wrong[1]} "
+            f"of the {counts[1]} rows that reach them do not end it, by {rule!r}. So "
+            "the ends of counterfactuals cannot follow their new goals: use the stored "
+            "rewards, or correct these flags"
+        )
+    return True
 
 
 def _distances(

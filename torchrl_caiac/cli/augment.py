@@ -76,7 +76,8 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         "--reward",
         choices=["stored", "sparse"],
         help="rewards of counterfactuals: those of the original, or sparse ones of the "
-        "new goals; must be given if the data have goals and rewards",
+        "new goals, with the ends of tasks that end there; must be given if the data "
+        "have goals and rewards",
     )
     parser.add_argument(
         "--reward-tolerance",
