@@ -15,7 +15,13 @@ from typing import Any
 
 from tensordict import TensorDict
 
-from torchrl_caiac._files import claim_folder, plain, read_json, write_json
+from torchrl_caiac._files import (
+    UnreadableFileError,
+    claim_folder,
+    plain,
+    read_json,
+    write_json,
+)
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import UsageError
 from torchrl_caiac.data import (
@@ -23,6 +29,7 @@ from torchrl_caiac.data import (
     action_bounds,
     load_transitions,
     open_dataset,
+    verify_digests,
     write_transitions,
 )
 from torchrl_caiac.data.digests import data_digest, file_digest, has_digests
