@@ -11,7 +11,12 @@ from tensordict import TensorDict
 from tests.augment.conftest import GOALS, TOLERANCE, score, with_goals
 from tests.pushes import LAYOUT, push_transitions
 from torchrl_caiac.augment import augment_dataset, needs_reward
-from torchrl_caiac.data import action_bounds, load_transitions, verify_digests
+from torchrl_caiac.data import (
+    action_bounds,
+    load_transitions,
+    verify_digests,
+    write_digests,
+)
 from torchrl_caiac.scored import ScoredDataset
 from torchrl_caiac.trajectories import trajectory_index
 
@@ -296,3 +301,41 @@ def test_a_ratio_out_of_range(
 ) -> None:
     with pytest.raises(ValueError, match="ratio must be between"):
         augment_dataset(plain, tmp_path / "made", ratio, progress=False)
+
+
+@pytest.mark.parametrize("kind", ["transitions", "trajectories"])
+def test_more_than_the_disk_has_space_for(
+    plain: ScoredDataset, tmp_path: Path, kind: str
+) -> None:
+    with pytest.raises(OSError, match=r"at the ratio 0\.99.* GB left: lower the ratio"):
+        augment_dataset(plain, tmp_path / "made", 1 - 1e-13, kind=kind, progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["scored"]
+
+
+def test_the_result_of_a_faster_call_stays(
+    plain: ScoredDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tmp_path / "made"
+
+    def slow(folder: Path, **options: object) -> None:
+        write_digests(folder, **options)
+        made.mkdir()
+        (made / "other").touch()
+
+    monkeypatch.setattr("torchrl_caiac.augment.dataset.write_digests", slow)
+    with pytest.raises(FileExistsError):
+        augment_dataset(plain, made, progress=False)
+    assert [p.name for p in made.iterdir()] == ["other"]
+    assert {p.name for p in tmp_path.iterdir()} == {"made", "scored"}
+
+
+@pytest.mark.parametrize("place", ["source", "source/more", "", "scored", "scored/a"])
+def test_a_place_of_the_dataset_itself(
+    plain: ScoredDataset, tmp_path: Path, place: str
+) -> None:
+    (tmp_path / "source").mkdir()
+    source = {"source": str(tmp_path / "source")}
+    scored = ScoredDataset(**{**vars(plain), "source": source})
+    with pytest.raises(ValueError, match="write elsewhere"):
+        augment_dataset(scored, tmp_path / place, overwrite=True, progress=False)
+    assert {p.name for p in tmp_path.iterdir()} == {"source", "scored"}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -87,9 +89,11 @@ def augment_dataset(
 
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
-        OSError: the disk is full.
-        ValueError: an argument is out of range; nothing can be swapped; the choice of
-            rewards is missing; no sparse reward agrees with the stored ones, or the
+        OSError: the disk has too little space, which is found before anything is
+            written.
+        ValueError: an argument is out of range; ``path`` is the scored dataset or what
+            it was made from, or one of them is inside of the other; nothing can be
+            swapped; the choice of rewards is missing; no sparse reward agrees with the stored ones, or the
             task ends in other rows than those that reach their goals.
 
     Examples:
@@ -99,14 +103,19 @@ def augment_dataset(
         raise ValueError(f"ratio must be between 0 and 1, got {ratio}")
     if kind not in ("transitions", "trajectories"):
         raise ValueError(f"kind must be 'transitions' or 'trajectories', got {kind!r}")
+    check_target(path, scored)
     check_free(path, overwrite)
     options = _rewards(scored, reward, tolerance)
     generator = torch.Generator().manual_seed(seed)
     data = _kept(scored)
     index = trajectory_index(scored.data)
+    before = len(data) if originals else 0
+    first = _flagged(data[:1].to_tensordict(), scored).exclude(*_scores(scored))
     parts: Iterator[TensorDictBase]
     if kind == "trajectories":
         count = _count(ratio, len(index.ends))
+        # Before the plan, which needs memory for each of them.
+        _check_space(path, first, before + count * int(index.lengths.min()), ratio)
         plan = TrajectoryPlan(scored, count, generator)
         rows, number = plan.rows, count
         parts = counterfactual_trajectories(plan, data, **options)
@@ -121,12 +130,10 @@ def augment_dataset(
         parts = _single_steps(
             counterfactual_transitions(scored, data, rows, generator, **options)
         )
-    before = len(data) if originals else 0
+    _check_space(path, first, before + rows, ratio)
     episode = _first_id(scored.data["episode"], number) if originals else 0
     bounds = action_bounds(scored.data)
     with whole_transitions(path) as folder:
-        first = _flagged(data[:1].to_tensordict(), scored)
-        first = first.exclude(*_scores(scored))
         stored = first.expand(before + rows).memmap_like(folder)
         reserve(folder)
         _copy(data[:before], stored, scored)
@@ -155,7 +162,37 @@ def augment_dataset(
         write_digests(folder, source=source)
         if bounds is not None:
             write_action_bounds(folder, *bounds)
+        check_free(path, overwrite)  # another process may have been faster
     return load_transitions(Path(path))
+
+
+def check_target(path: str | os.PathLike[str], scored: ScoredDataset) -> None:
+    """Raises if a result would replace the dataset that it is made from.
+
+    Args:
+        path (path): the file or folder to write.
+        scored (ScoredDataset): the dataset.
+
+    Raises:
+        ValueError: ``path`` is the scored dataset or the file or folder that it was
+            made from, or one of them is inside of the other.
+
+    Examples:
+        See :doc:`/cli`.
+    """
+    target = Path(path).resolve()
+    places = {"the scored dataset": scored.path}
+    source = scored.source.get("source")
+    if isinstance(source, str) and Path(source).exists():
+        places["the data that were scored"] = Path(source)
+    for what, place in places.items():
+        place = place.resolve()
+        if target == place:
+            raise ValueError(f"{path} is {what}: write elsewhere")
+        if target.is_relative_to(place) or place.is_relative_to(target):
+            inside = target.is_relative_to(place)
+            text = f"is inside of {place}," if inside else f"contains {place},"
+            raise ValueError(f"{path} {text} {what}: write elsewhere")
 
 
 def needs_reward(scored: ScoredDataset) -> bool:
@@ -177,6 +214,24 @@ def needs_reward(scored: ScoredDataset) -> bool:
 def _count(ratio: float, originals: int) -> int:
     """Returns the number of counterfactuals, at least one."""
     return max(1, round(ratio / (1 - ratio) * originals))
+
+
+def _check_space(
+    path: str | os.PathLike[str], first: TensorDictBase, rows: int, ratio: float
+) -> None:
+    """Raises if a disk has too little space for ``rows`` rows such as ``first``."""
+    folder = Path(path).absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    size = rows * sum(x.numel() * x.element_size() for x in first.values(True, True))
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        raise OSError(
+            errno.ENOSPC,
+            f"{rows} transitions at the ratio {ratio} need {size / 1e9:.1f} GB, and "
+            f"the disk of {folder} has {free / 1e9:.1f} GB left: lower the ratio, or "
+            "write to another disk",
+        )
 
 
 def _first_id(ids: torch.Tensor, number: int) -> int:
