@@ -8,10 +8,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.augment.conftest import GOALS, TOLERANCE, score
-from tests.pushes import LAYOUT
+from tests.augment.conftest import GOALS, TOLERANCE, score, with_goals
+from tests.pushes import LAYOUT, push_transitions
 from torchrl_caiac.augment import augment_dataset, needs_reward
-from torchrl_caiac.data import action_bounds, load_transitions, verify_digests
+from torchrl_caiac.data import (
+    action_bounds,
+    load_transitions,
+    verify_digests,
+    write_digests,
+)
 from torchrl_caiac.scored import ScoredDataset
 from torchrl_caiac.trajectories import trajectory_index
 
@@ -130,6 +135,28 @@ def test_counterfactuals_alone(plain: ScoredDataset, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["transitions", "trajectories"])
+def test_ids_are_those_of_no_original(
+    plain: ScoredDataset, tmp_path: Path, kind: str
+) -> None:
+    data = plain.data.exclude("caiac").to_tensordict()
+    data["episode"] = torch.tensor([3, 9, 4, 70, -5, 8])[data["episode"]]
+    scored = score(tmp_path / "others", data, LAYOUT)
+    made = augment_dataset(scored, tmp_path / "made", kind=kind, progress=False)
+    assert torch.equal(made["episode"][:240], data["episode"])
+    new = made["episode"][240:].unique()
+    assert new.tolist() == list(range(71, 71 + len(new)))
+    assert len(trajectory_index(made).ends) == 6 + len(new)
+
+
+def test_no_room_for_more_ids(plain: ScoredDataset, tmp_path: Path) -> None:
+    data = plain.data.exclude("caiac").to_tensordict()
+    data["episode"] += 2**63 - 100
+    scored = score(tmp_path / "others", data, LAYOUT)
+    with pytest.raises(ValueError, match="no room for 240 more"):
+        augment_dataset(scored, tmp_path / "made", progress=False)
+
+
+@pytest.mark.parametrize("kind", ["transitions", "trajectories"])
 def test_goals_and_rewards_follow(
     goals: ScoredDataset, tmp_path: Path, kind: str
 ) -> None:
@@ -147,6 +174,64 @@ def test_goals_and_rewards_follow(
     )
     assert torch.equal(kept["desired_goal"], made["desired_goal"])
     assert not torch.equal(kept["next", "reward"], made["next", "reward"])
+
+
+def ending_tasks() -> TensorDict:
+    """Episodes that end in the first row that reaches the goals, if any does."""
+    data = with_goals(push_transitions((40, 30, 50, 40, 35, 45) * 4))
+    reached = data["next", "reward"].squeeze(-1) == 0
+    kept = []
+    for rows in torch.arange(len(data)).split((40, 30, 50, 40, 35, 45) * 4):
+        hits = reached[rows].nonzero()[:, 0]
+        kept.append(rows[: int(hits[0]) + 1] if len(hits) else rows)
+    ends = torch.tensor([int(rows[-1]) for rows in kept])
+    data["next", "done"][ends] = True
+    data["next", "terminated"] = data["next", "done"] & reached.unsqueeze(-1)
+    data["next", "truncated"] = data["next", "done"] & ~data["next", "terminated"]
+    return data[torch.cat(kept)].clone()
+
+
+@pytest.mark.parametrize("kind", ["transitions", "trajectories"])
+@pytest.mark.filterwarnings("error")
+def test_ends_of_the_task_follow_the_goals(tmp_path: Path, kind: str) -> None:
+    data = ending_tasks()
+    scored = score(tmp_path / "scored", data, GOALS)
+    assert int(data["next", "terminated"].sum()) >= 5
+    made = augment_dataset(
+        scored, tmp_path / "made", 0.8, kind=kind, reward="sparse", progress=False
+    )
+    after = made["next"]
+    gap = after["observation"][:, [2, 4]] - made["desired_goal"]
+    near = (gap.abs() <= TOLERANCE).all(-1, keepdim=True)
+    assert torch.equal(after["terminated"], near)
+    assert torch.equal(after["reward"], near.float() - 1)
+    last = torch.ones(len(made), 1, dtype=torch.bool)
+    last[:-1, 0] = made["episode"].diff() != 0
+    assert torch.equal(after["done"], last)
+    assert torch.equal(after["truncated"], last & ~near)
+    # Some ends of originals are no ends any more.
+    new = made[flags(made)]
+    assert new["next", "truncated"].any() and new["next", "terminated"].any()
+    if kind == "trajectories":
+        inside = ~last[:-1, 0]
+        assert torch.equal(
+            after["observation"][:-1][inside], made["observation"][1:][inside]
+        )
+
+
+def test_ends_of_the_task_that_do_not_follow_from_the_goals(
+    goals: ScoredDataset, tmp_path: Path
+) -> None:
+    data = goals.data.exclude("caiac").to_tensordict()
+    data["next", "terminated"] = data["next", "done"].clone()
+    data["next", "truncated"].zero_()
+    scored = score(tmp_path / "ends", data, GOALS)
+    before = {path.name for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match="rows that reach them do not end it"):
+        augment_dataset(scored, tmp_path / "made", reward="sparse", progress=False)
+    assert {path.name for path in tmp_path.iterdir()} == before
+    kept = augment_dataset(scored, tmp_path / "made", reward="stored", progress=False)
+    assert kept["next", "terminated"].any()
 
 
 def test_rewards_must_be_chosen(goals: ScoredDataset, tmp_path: Path) -> None:
@@ -216,3 +301,41 @@ def test_a_ratio_out_of_range(
 ) -> None:
     with pytest.raises(ValueError, match="ratio must be between"):
         augment_dataset(plain, tmp_path / "made", ratio, progress=False)
+
+
+@pytest.mark.parametrize("kind", ["transitions", "trajectories"])
+def test_more_than_the_disk_has_space_for(
+    plain: ScoredDataset, tmp_path: Path, kind: str
+) -> None:
+    with pytest.raises(OSError, match=r"at the ratio 0\.99.* GB left: lower the ratio"):
+        augment_dataset(plain, tmp_path / "made", 1 - 1e-13, kind=kind, progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["scored"]
+
+
+def test_the_result_of_a_faster_call_stays(
+    plain: ScoredDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tmp_path / "made"
+
+    def slow(folder: Path, **options: object) -> None:
+        write_digests(folder, **options)
+        made.mkdir()
+        (made / "other").touch()
+
+    monkeypatch.setattr("torchrl_caiac.augment.dataset.write_digests", slow)
+    with pytest.raises(FileExistsError):
+        augment_dataset(plain, made, progress=False)
+    assert [p.name for p in made.iterdir()] == ["other"]
+    assert {p.name for p in tmp_path.iterdir()} == {"made", "scored"}
+
+
+@pytest.mark.parametrize("place", ["source", "source/more", "", "scored", "scored/a"])
+def test_a_place_of_the_dataset_itself(
+    plain: ScoredDataset, tmp_path: Path, place: str
+) -> None:
+    (tmp_path / "source").mkdir()
+    source = {"source": str(tmp_path / "source")}
+    scored = ScoredDataset(**{**vars(plain), "source": source})
+    with pytest.raises(ValueError, match="write elsewhere"):
+        augment_dataset(scored, tmp_path / place, overwrite=True, progress=False)
+    assert {p.name for p in tmp_path.iterdir()} == {"source", "scored"}

@@ -86,22 +86,47 @@ def test_rewards_that_do_not_depend_on_the_goal() -> None:
         find_sparse_reward(data, FLAT)
 
 
-def test_a_goal_that_is_never_reached() -> None:
+@pytest.mark.parametrize("tolerance", [None, 0.3])
+@pytest.mark.parametrize("value", [-1, 0])
+def test_only_one_reward(value: float, tolerance: float | None) -> None:
     data = transitions(FLAT, False, 0.3, -1, 0)
-    data["next", "reward"].fill_(-1)
-    data["desired_goal"] += 10
-    with pytest.raises(ValueError, match="no tolerance can be found"):
+    data["next", "reward"].fill_(value)
+    with pytest.raises(ValueError, match=f"all 500 stored rewards are {value}, "):
+        find_sparse_reward(data, FLAT, tolerance)
+
+
+def rare(successes: int) -> TensorDict:
+    """Few rows reach their goals by 0.05; as many are at a distance of 0.2."""
+    data = transitions(FLAT, False, 0.3, 0, 1).expand(40, 500).reshape(-1).clone()
+    data["desired_goal"] = data["next", "achieved_goal"] + 10
+    data["next", "reward"].zero_()
+    for rows, gap in ((slice(successes), 0.03), (slice(100, 100 + successes), 0.2)):
+        data["desired_goal"][rows] = data["next", "achieved_goal"][rows]
+        data["desired_goal"][rows, 2] += gap
+    data["next", "reward"][:successes] = 1
+    return data
+
+
+def test_few_successes() -> None:
+    data = rare(10)
+    assert 0.03 < find_sparse_reward(data, FLAT).tolerance < 0.2
+    assert find_sparse_reward(data, FLAT, 0.05).tolerance == 0.05
+    # Wrong in 10 of 20000 rows only, but in all that reach their goals.
+    with pytest.raises(ValueError, match=r"0\.00% of the 10 with the reward 1 and"):
+        find_sparse_reward(data, FLAT, 0.001)
+
+
+def test_few_successes_that_do_not_depend_on_the_goal() -> None:
+    data = rare(10)
+    data["next", "reward"].zero_()
+    data["next", "reward"][500:515] = 1
+    with pytest.raises(ValueError, match="of the 15 with the reward 1"):
         find_sparse_reward(data, FLAT)
-    found = find_sparse_reward(data, FLAT, 0.3)
-    assert (found.low, found.high) == (-1, 0)
 
 
-def test_a_goal_that_is_always_reached() -> None:
-    data = transitions(FLAT, False, 0.3, -1, 0)
-    data["next", "reward"].fill_(0)
-    data["desired_goal"] = data["next", "achieved_goal"].clone()
-    found = find_sparse_reward(data, FLAT, 0.3)
-    assert (found.low, found.high) == (-1, 0)
+def test_too_few_successes() -> None:
+    with pytest.raises(ValueError, match="4 stored rewards are 1 and 19996 are 0"):
+        find_sparse_reward(rare(4), FLAT, 0.05)
 
 
 def test_no_rewards() -> None:

@@ -17,7 +17,7 @@ from tests.killing import run_killed
 from tests.pushes import push_transitions
 from torchrl_caiac.augment import augment_dataset
 from torchrl_caiac.cli import main
-from torchrl_caiac.data import load_transitions, write_transitions
+from torchrl_caiac.data import load_transitions, to_minari, write_transitions
 from torchrl_caiac.scored import open_scored
 
 
@@ -86,6 +86,16 @@ def test_minari(caiac: Caiac, scored: Path, arguments: list[str]) -> None:
     assert again.code == 2 and "exists" in again.error
 
 
+def test_the_minari_dataset_that_was_scored(caiac: Caiac, pushes: Path) -> None:
+    to_minari(push_transitions(), "pushes/play-v0", progress=False)
+    score = ("score", "pushes/play-v0", "--layout", "layout.json", "--out", "scored")
+    assert caiac(*score).code == 0
+    out = ("--out", "minari://pushes/play-v0", "--overwrite")
+    result = caiac("augment", "scored", *out)
+    assert result.code == 2 and "is the data that were scored" in result.error
+    assert minari.load_dataset("pushes/play-v0").total_steps == 240
+
+
 def test_trajectories_alone(caiac: Caiac, scored: Path) -> None:
     arguments = ("--trajectories", "--no-originals", "--ratio", "0.25", "--seed", "3")
     assert caiac("augment", scored, "--out", "more", *arguments).code == 0
@@ -104,6 +114,8 @@ def test_trajectories_alone(caiac: Caiac, scored: Path) -> None:
         (["--out", "scored/more"], "is inside of scored"),
         (["--out", "layout.json"], "the format .json is not known"),
         (["--out", "pushes"], "pushes exists"),
+        (["--out", "pushes", "--overwrite"], "pushes is the data that were scored"),
+        (["--out", "../work", "--overwrite"], "contains"),
     ],
 )
 def test_a_wrong_command_line(
@@ -154,6 +166,23 @@ def test_nothing_to_swap(caiac: Caiac, pushes: Path) -> None:
     result = caiac("augment", "few", "--out", "a.npz", "--trajectories")
     assert result.code == 1 and "no trajectory has" in result.error
     assert names() == before
+
+
+@pytest.mark.parametrize("out", ["a.npz", "a.h5"])
+def test_the_file_of_a_faster_call_stays(
+    caiac: Caiac, scored: Path, monkeypatch: pytest.MonkeyPatch, out: str
+) -> None:
+    import torchrl_caiac.cli.augment as command
+
+    def slow(*args: object, **options: object) -> object:
+        Path(out).write_text("other")
+        return augment_dataset(*args, **options)
+
+    monkeypatch.setattr(command, "augment_dataset", slow)
+    before = names()
+    result = caiac("augment", scored, "--out", out)
+    assert result.code == 2 and f"{out} has appeared" in result.error
+    assert Path(out).read_text() == "other" and names() == before | {out}
 
 
 def killed_while_augmenting() -> Iterator[None]:

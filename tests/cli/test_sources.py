@@ -14,7 +14,7 @@ import torch
 
 from tests.cli.conftest import Caiac
 from tests.pushes import push_arrays, push_transitions
-from torchrl_caiac.data import load_transitions, to_minari
+from torchrl_caiac.data import load_transitions, to_minari, write_transitions
 from torchrl_caiac.scored import open_scored
 
 LEROBOT = Path(__file__).parents[1] / "data" / "lerobot"
@@ -274,3 +274,31 @@ def test_a_folder_of_transitions_is_opened_where_it_is(
     assert {p: p.stat().st_mtime_ns for p in pushes.rglob("*")} == before
     assert not (tmp_path / "cache").exists()
     assert len(load_transitions(pushes)) == 240
+
+
+@pytest.mark.parametrize("out", ["scored", "fresh"])
+def test_a_folder_that_was_changed_in_place(
+    caiac: Caiac, scored: Path, out: str
+) -> None:
+    load_transitions("pushes")["action"][7] *= 0.5
+    score = ("--layout", "layout.json", "--out", out)
+    result = caiac("score", "pushes", *score)
+    assert result.code == 1 and "action.memmap changed" in result.error
+    assert "with write_transitions" in result.error
+    assert not Path("fresh").exists()
+    write_transitions(load_transitions("pushes"), "again")
+    assert caiac("score", "again", "--layout", "layout.json", "--out", "b").code == 0
+
+
+def test_data_that_are_counterfactual_already(caiac: Caiac, scored: Path) -> None:
+    out = "minari://pushes/more-v0"
+    assert caiac("augment", scored, "--out", "more").code == 0
+    assert caiac("augment", scored, "--out", out).code == 0
+    infos = '--option=infos=["counterfactual"]'
+    for number, source in enumerate((["more"], [out, infos])):
+        score = ("score", *source, "--layout", "layout.json", "--out", f"s{number}")
+        for _ in range(2):  # a repeated call, that resumes, warns too
+            result = caiac(*score)
+            assert result.code == 0, result.err
+            assert "240 of 480 transitions of" in result.err
+    assert "are counterfactual" not in caiac("inspect", scored).err

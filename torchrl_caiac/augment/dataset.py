@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +15,7 @@ from tqdm.auto import tqdm
 
 from torchrl_caiac._files import reserve
 from torchrl_caiac._keys import path as path_of
-from torchrl_caiac.augment.rewards import find_sparse_reward
+from torchrl_caiac.augment.rewards import ends_at_goals, find_sparse_reward
 from torchrl_caiac.augment.trajectories import (
     TrajectoryPlan,
     counterfactual_trajectories,
@@ -70,9 +72,10 @@ def augment_dataset(
             ``"transitions"``.
         reward (str, optional): the rewards of counterfactuals. ``"stored"``: those of
             the original transition; ``"sparse"``: recomputed, see
-            :func:`~torchrl_caiac.augment.find_sparse_reward`. It must be given if the
-            data have rewards, and goals that the layout maps. Defaults to ``None``:
-            ``"stored"``.
+            :func:`~torchrl_caiac.augment.find_sparse_reward`. If the task ends where
+            goals are reached, ``("next", "terminated")`` is recomputed too, and
+            trajectories end there. It must be given if the data have rewards, and goals
+            that the layout maps. Defaults to ``None``: ``"stored"``.
         tolerance (float, optional): that of sparse rewards. Defaults to ``None``: found
             in the data.
         originals (bool): whether the originals are written too. Defaults to ``True``.
@@ -86,9 +89,12 @@ def augment_dataset(
 
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
-        OSError: the disk is full.
-        ValueError: an argument is out of range; nothing can be swapped; the choice of
-            rewards is missing; no sparse reward agrees with the stored ones.
+        OSError: the disk has too little space, which is found before anything is
+            written.
+        ValueError: an argument is out of range; ``path`` is the scored dataset or what
+            it was made from, or one of them is inside of the other; nothing can be
+            swapped; the choice of rewards is missing; no sparse reward agrees with the stored ones, or the
+            task ends in other rows than those that reach their goals.
 
     Examples:
         See :doc:`/cli`.
@@ -97,36 +103,48 @@ def augment_dataset(
         raise ValueError(f"ratio must be between 0 and 1, got {ratio}")
     if kind not in ("transitions", "trajectories"):
         raise ValueError(f"kind must be 'transitions' or 'trajectories', got {kind!r}")
+    check_target(path, scored)
     check_free(path, overwrite)
     options = _rewards(scored, reward, tolerance)
     generator = torch.Generator().manual_seed(seed)
     data = _kept(scored)
     index = trajectory_index(scored.data)
+    before = len(data) if originals else 0
+    first = _flagged(data[:1].to_tensordict(), scored).exclude(*_scores(scored))
     parts: Iterator[TensorDictBase]
     if kind == "trajectories":
         count = _count(ratio, len(index.ends))
+        # Before the plan, which needs memory for each of them.
+        _check_space(path, first, before + count * int(index.lengths.min()), ratio)
         plan = TrajectoryPlan(scored, count, generator)
         rows, number = plan.rows, count
         parts = counterfactual_trajectories(plan, data, **options)
+        if "terminated_fn" in options:
+            # Only the new ends say how long the trajectories are: make them twice.
+            state = generator.get_state()
+            rows = sum(len(part) for part in _ended(parts))
+            generator.set_state(state)
+            parts = _ended(counterfactual_trajectories(plan, data, **options))
     else:
         rows = number = _count(ratio, len(data))
         parts = _single_steps(
             counterfactual_transitions(scored, data, rows, generator, **options)
         )
-    before = len(data) if originals else 0
+    _check_space(path, first, before + rows, ratio)
+    episode = _first_id(scored.data["episode"], number) if originals else 0
     bounds = action_bounds(scored.data)
     with whole_transitions(path) as folder:
-        first = _flagged(data[:1].to_tensordict(), scored)
-        first = first.exclude(*_scores(scored))
         stored = first.expand(before + rows).memmap_like(folder)
         reserve(folder)
         _copy(data[:before], stored, scored)
-        place, episode = before, len(index.ends) if originals else 0
+        place = before
         with tqdm(total=number, disable=not progress, desc=kind, unit="") as bar:
             for part in parts:
                 part = part.select(*first.keys(True, True))
-                ids = torch.arange(len(part)) if kind == "transitions" else 0
-                part["episode"] = torch.zeros_like(part["episode"]) + episode + ids
+                ids = torch.zeros_like(part["episode"]) + episode
+                if kind == "transitions":
+                    ids += torch.arange(len(part)).reshape(ids.shape)
+                part["episode"] = ids
                 stored[place : place + len(part)].update_(part)
                 place += len(part)
                 added = len(part) if kind == "transitions" else 1
@@ -144,7 +162,37 @@ def augment_dataset(
         write_digests(folder, source=source)
         if bounds is not None:
             write_action_bounds(folder, *bounds)
+        check_free(path, overwrite)  # another process may have been faster
     return load_transitions(Path(path))
+
+
+def check_target(path: str | os.PathLike[str], scored: ScoredDataset) -> None:
+    """Raises if a result would replace the dataset that it is made from.
+
+    Args:
+        path (path): the file or folder to write.
+        scored (ScoredDataset): the dataset.
+
+    Raises:
+        ValueError: ``path`` is the scored dataset or the file or folder that it was
+            made from, or one of them is inside of the other.
+
+    Examples:
+        See :doc:`/cli`.
+    """
+    target = Path(path).resolve()
+    places = {"the scored dataset": scored.path}
+    source = scored.source.get("source")
+    if isinstance(source, str) and Path(source).exists():
+        places["the data that were scored"] = Path(source)
+    for what, place in places.items():
+        place = place.resolve()
+        if target == place:
+            raise ValueError(f"{path} is {what}: write elsewhere")
+        if target.is_relative_to(place) or place.is_relative_to(target):
+            inside = target.is_relative_to(place)
+            text = f"is inside of {place}," if inside else f"contains {place},"
+            raise ValueError(f"{path} {text} {what}: write elsewhere")
 
 
 def needs_reward(scored: ScoredDataset) -> bool:
@@ -166,6 +214,40 @@ def needs_reward(scored: ScoredDataset) -> bool:
 def _count(ratio: float, originals: int) -> int:
     """Returns the number of counterfactuals, at least one."""
     return max(1, round(ratio / (1 - ratio) * originals))
+
+
+def _check_space(
+    path: str | os.PathLike[str], first: TensorDictBase, rows: int, ratio: float
+) -> None:
+    """Raises if a disk has too little space for ``rows`` rows such as ``first``."""
+    folder = Path(path).absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    size = rows * sum(x.numel() * x.element_size() for x in first.values(True, True))
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        raise OSError(
+            errno.ENOSPC,
+            f"{rows} transitions at the ratio {ratio} need {size / 1e9:.1f} GB, and "
+            f"the disk of {folder} has {free / 1e9:.1f} GB left: lower the ratio, or "
+            "write to another disk",
+        )
+
+
+def _first_id(ids: torch.Tensor, number: int) -> int:
+    """Returns the first of ``number`` trajectory ids that the originals do not have."""
+    first = int(ids.max()) + 1
+    if ids.is_floating_point():
+        largest = int(2 / torch.finfo(ids.dtype).eps)  # the next integer is rounded
+    else:
+        largest = torch.iinfo(ids.dtype).max
+    if first + number - 1 > largest:
+        raise ValueError(
+            f"'episode' has ids up to {first - 1}, and its type {ids.dtype} has no "
+            f"room for {number} more: number the trajectories from 0, or leave out the "
+            "originals"
+        )
+    return first
 
 
 def _scores(scored: ScoredDataset) -> list[Any]:
@@ -248,4 +330,19 @@ def _rewards(
         return {}
     if not scored.layout.goal:
         raise ValueError("sparse rewards need goals, and the layout has none")
-    return {"reward_fn": find_sparse_reward(scored.data, scored.layout, tolerance)}
+    rule = find_sparse_reward(scored.data, scored.layout, tolerance)
+    if not ends_at_goals(rule, scored.data, scored.layout):
+        return {"reward_fn": rule}
+    return {"reward_fn": rule, "terminated_fn": rule.is_reached}
+
+
+def _ended(parts: Iterator[TensorDictBase]) -> Iterator[TensorDictBase]:
+    """Cuts trajectories after the first row that ends the task, and closes others."""
+    for part in parts:
+        ends = part[_KEYS.terminated].reshape(-1).nonzero()[:, 0]
+        part = part[: int(ends[0]) + 1] if len(ends) else part
+        after, last = part["next"], slice(len(part) - 1, len(part))
+        after["done"][last] = True
+        if after.get("truncated", None) is not None:
+            after["truncated"][last] = ~after["terminated"][last]
+        yield part

@@ -12,10 +12,14 @@ from torchrl_caiac._keys import get_leaf
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.rewards import goal_vectors
 
-__all__ = ["SparseReward", "find_sparse_reward"]
+__all__ = ["SparseReward", "ends_at_goals", "find_sparse_reward"]
 
 _CHUNK = 1 << 16  # rows read at a time
 _AGREE = 0.999  # share of rows in which a sparse reward must be the stored one
+# The same of the rows with each of the two rewards. Where one of them is rare, a rule
+# that never gives it agrees with nearly all rows.
+_AGREE_EACH = 0.99
+_FEWEST = 5  # rows with each of the two rewards, from which a rule can be proven
 
 
 class SparseReward:
@@ -62,8 +66,14 @@ class SparseReward:
         Returns:
             torch.Tensor: ``[C]``.
         """
-        near = self.distance(next_achieved, desired) <= self.tolerance
+        near = self.is_reached(next_achieved, desired)
         return torch.where(near, self.high, self.low)
+
+    def is_reached(
+        self, next_achieved: torch.Tensor, desired: torch.Tensor
+    ) -> torch.Tensor:
+        """Returns whether the goals are reached, bool ``[C]``."""
+        return self.distance(next_achieved, desired) <= self.tolerance
 
     def distance(
         self, next_achieved: torch.Tensor, desired: torch.Tensor
@@ -103,12 +113,14 @@ def find_sparse_reward(
         reward_key (NestedKey): the rewards. Defaults to ``("next", "reward")``.
 
     Returns:
-        SparseReward: which agrees with the stored rewards in 99.9 % of the rows.
+        SparseReward: which agrees with the stored rewards in 99.9 % of the rows, and in
+        99 % of the rows with each of the two rewards.
 
     Raises:
         KeyError: the data have no rewards or goals.
-        ValueError: the stored rewards have more than two values; or no sparse reward,
-            or not that with this tolerance, agrees with them.
+        ValueError: the stored rewards have more than two values, or fewer than 5 rows
+            have one of them; or no sparse reward, or not that with this tolerance,
+            agrees with them.
 
     Examples:
         >>> import torch
@@ -120,13 +132,13 @@ def find_sparse_reward(
         ... )
         >>> data = TensorDict(
         ...     {
-        ...         "desired_goal": torch.zeros(3, 1),
+        ...         "desired_goal": torch.zeros(15, 1),
         ...         "next": {
-        ...             "observation": torch.tensor([[0.0], [0.1], [0.5]]),
-        ...             "reward": torch.tensor([[0.0], [0.0], [-1.0]]),
+        ...             "observation": torch.tensor([[0.0], [0.1], [0.5]]).repeat(5, 1),
+        ...             "reward": torch.tensor([[0.0], [0.0], [-1.0]]).repeat(5, 1),
         ...         },
         ...     },
-        ...     [3],
+        ...     [15],
         ... )
         >>> find_sparse_reward(data, layout).tolerance
         0.2
@@ -142,24 +154,117 @@ def find_sparse_reward(
             "reward has two: use the stored rewards, or recompute them in your own "
             "code with CAIACTransform(reward_fn=...)"
         )
-    found = []
-    for groups in _forms(data, layout):
-        rule = SparseReward(groups, 0.0)
-        gaps = torch.cat(
-            [
-                rule.distance(*goal_vectors(data[i : i + _CHUNK], layout)).double()
-                for i in range(0, len(data), _CHUNK)
-            ]
+    low, high = float(values[0]), float(values[-1])
+    reached = reward == high
+    counts = int(reached.sum()), int((~reached).sum())
+    if len(values) < 2 or min(counts) < _FEWEST:
+        found_text = (
+            f"all {len(reward)} stored rewards are {high:g}"
+            if len(values) < 2
+            else f"{counts[0]} stored rewards are {high:g} and {counts[1]} are {low:g}"
         )
-        found.append(_fitted(rule, gaps, reward, values, tolerance))
-    best, agreement = max(found, key=lambda pair: pair[1])
-    if agreement < _AGREE:
+        raise ValueError(
+            f"{found_text}, expected at least {_FEWEST} rows with each of two rewards: "
+            "no sparse reward can be proven on so few; use the stored rewards, or "
+            "recompute them in your own code with CAIACTransform(reward_fn=...)"
+        )
+    fits = []
+    for groups in _forms(data, layout):
+        rule = SparseReward(groups, 0.0, low, high)
+        gaps = _distances(rule, data, layout)
+        rule.tolerance = _between(gaps, reached) if tolerance is None else tolerance
+        right = (gaps <= rule.tolerance) == reached
+        each = [float(right[rows].double().mean()) for rows in (reached, ~reached)]
+        fits.append((rule, float(right.double().mean()), each))
+    best, overall, each = max(fits, key=lambda fit: min(fit[2]))
+    if overall < _AGREE or min(each) < _AGREE_EACH:
         hint = "" if tolerance is None else "another tolerance, or "
         raise ValueError(
-            f"{best!r} agrees with the stored rewards in {agreement:.1%} of the rows, "
-            f"expected at least {_AGREE:.1%}: give {hint}the stored rewards"
+            f"{best!r} agrees with the stored rewards in {overall:.2%} of all rows, "
+            f"in {each[0]:.2%} of the {counts[0]} with the reward {high:g} and in "
+            f"{each[1]:.2%} of the {counts[1]} with {low:g}, expected at least "
+            f"{_AGREE:.1%} of all and {_AGREE_EACH:.0%} of each: give {hint}the stored "
+            "rewards"
         )
     return best
+
+
+def ends_at_goals(
+    rule: SparseReward,
+    data: TensorDictBase,
+    layout: EntityLayout,
+    *,
+    terminated_key: NestedKey = ("next", "terminated"),
+) -> bool:
+    """Returns whether the task ends where goals are reached, or never.
+
+    Args:
+        rule (SparseReward): says which goals are reached.
+        data (TensorDictBase): transitions ``[T]`` with goals.
+        layout (EntityLayout): the entities, with goals.
+
+    Keyword Args:
+        terminated_key (NestedKey): whether the task ends. Defaults to ``("next",
+            "terminated")``.
+
+    Returns:
+        bool: ``True`` if it ends exactly where the goals are reached, ``False`` if it
+        never ends or the data do not say.
+
+    Raises:
+        ValueError: it ends in other rows.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.augment import SparseReward
+        >>> from torchrl_caiac.augment.rewards import ends_at_goals
+        >>> layout = EntityLayout(
+        ...     {"cup": [0]}, goal={"cup": [0]}, achieved={"cup": [0]}
+        ... )
+        >>> data = TensorDict(
+        ...     {
+        ...         "desired_goal": torch.zeros(2, 1),
+        ...         "next": {
+        ...             "observation": torch.tensor([[0.0], [0.5]]),
+        ...             "terminated": torch.tensor([[True], [False]]),
+        ...         },
+        ...     },
+        ...     [2],
+        ... )
+        >>> ends_at_goals(SparseReward(((0,),), 0.1), data, layout)
+        True
+    """
+    stored = data.get(terminated_key, None)
+    if stored is None or not bool(stored.any()):
+        return False
+    ends = stored.as_subclass(torch.Tensor).flatten().bool()
+    reached = _distances(rule, data, layout) <= rule.tolerance
+    wrong = [int((ends & ~reached).sum()), int((reached & ~ends).sum())]
+    counts = [int(ends.sum()), int(reached.sum())]
+    shares = [w / max(c, 1) for w, c in zip(wrong, counts, strict=True)]
+    if max(shares) > 1 - _AGREE_EACH:
+        raise ValueError(
+            f"{terminated_key!r} does not say where goals are reached: {wrong[0]} of "
+            f"the {counts[0]} rows that end the task do not reach them, and {wrong[1]} "
+            f"of the {counts[1]} rows that reach them do not end it, by {rule!r}. So "
+            "the ends of counterfactuals cannot follow their new goals: use the stored "
+            "rewards, or correct these flags"
+        )
+    return True
+
+
+def _distances(
+    rule: SparseReward, data: TensorDictBase, layout: EntityLayout
+) -> torch.Tensor:
+    """Returns the distance of each row from its goal, float64 ``[T]``."""
+    return torch.cat(
+        [
+            rule.distance(*goal_vectors(data[i : i + _CHUNK], layout)).double()
+            for i in range(0, len(data), _CHUNK)
+        ]
+    )
 
 
 def _forms(
@@ -180,30 +285,6 @@ def _forms(
     each = tuple(group for group in each if group)
     everything = (tuple(range(width)),)
     return [each] if each == everything else [each, everything]
-
-
-def _fitted(
-    rule: SparseReward,
-    gaps: torch.Tensor,
-    reward: torch.Tensor,
-    values: torch.Tensor,
-    tolerance: float | None,
-) -> tuple[SparseReward, float]:
-    """Returns a rule with its values and tolerance, and its share of right rewards."""
-    low, high = float(values[0]), float(values[-1])
-    if len(values) == 1:  # always, or never reached
-        never = tolerance is not None and bool((gaps > tolerance).all())
-        low, high = (low, low + 1) if never else (high - 1, high)
-        if tolerance is None:
-            raise ValueError(
-                f"all stored rewards are {low if never else high}, from which no "
-                "tolerance can be found: give one, or use the stored rewards"
-            )
-    reached = reward == high
-    if tolerance is None:
-        tolerance = _between(gaps, reached)
-    agree = ((gaps <= tolerance) == reached).double().mean()
-    return SparseReward(rule.groups, tolerance, low, high), float(agree)
 
 
 def _between(gaps: torch.Tensor, reached: torch.Tensor) -> float:

@@ -17,6 +17,7 @@ from torchrl_caiac.augment import (
     export_npz,
     needs_reward,
 )
+from torchrl_caiac.augment.dataset import check_target
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
 from torchrl_caiac.cli.sources import scored_folder
@@ -76,7 +77,8 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         "--reward",
         choices=["stored", "sparse"],
         help="rewards of counterfactuals: those of the original, or sparse ones of the "
-        "new goals; must be given if the data have goals and rewards",
+        "new goals, with the ends of tasks that end there; must be given if the data "
+        "have goals and rewards",
     )
     parser.add_argument(
         "--reward-tolerance",
@@ -115,6 +117,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise UsageError(f"--out {args.out} is inside of {folder}: write elsewhere")
     with console.step("reading the scored dataset"):
         scored = open_scored(folder)
+    try:
+        check_target(target, scored)
+    except ValueError as error:
+        raise UsageError(f"--out {args.out}: {error}") from error
+    source = str(scored.source.get("source"))
+    if is_minari and _minari_id(source) == _minari_id(args.out):
+        raise UsageError(
+            f"--out {args.out} is the data that were scored: write another"
+        )
     if args.reward is None and needs_reward(scored):
         raise UsageError(
             "the data have goals and rewards: pass --reward sparse, or --reward stored "
@@ -193,6 +204,11 @@ def _write(
             data = _augmented(args, scored, work, console)
             with console.step("writing the file"):
                 export(data, partial, entities=names, overwrite=True)
+            if out.exists() and not args.overwrite:
+                raise UsageError(
+                    f"{out} has appeared in the meantime, and stays as it is: give "
+                    "another name, or pass --overwrite"
+                )
             return _summary(data, scored, args)
         finally:
             shutil.rmtree(work, ignore_errors=True)

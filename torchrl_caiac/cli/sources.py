@@ -15,7 +15,13 @@ from typing import Any
 
 from tensordict import TensorDict
 
-from torchrl_caiac._files import claim_folder, plain, read_json, write_json
+from torchrl_caiac._files import (
+    UnreadableFileError,
+    claim_folder,
+    plain,
+    read_json,
+    write_json,
+)
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import UsageError
 from torchrl_caiac.data import (
@@ -23,6 +29,7 @@ from torchrl_caiac.data import (
     action_bounds,
     load_transitions,
     open_dataset,
+    verify_digests,
     write_transitions,
 )
 from torchrl_caiac.data.digests import data_digest, file_digest, has_digests
@@ -182,12 +189,20 @@ def describe_source(
 
     Raises:
         UsageError: a path does not exist.
+        UnreadableFileError: transitions have changed since they were written.
     """
     path = _local(source)
     name = source if path is None else str(path.resolve())
     files: dict[str, Any] = {}
     root = path if path is not None else _minari_folder(source)
     if root is not None and root.is_dir() and has_digests(root):
+        try:
+            verify_digests(root)
+        except UnreadableFileError as error:
+            raise UnreadableFileError(
+                f"{error}; if the change is meant, write the opened transitions to a "
+                "new folder with write_transitions, and give that folder as DATA"
+            ) from error
         files = {".": data_digest(root)}
     elif root is not None:
         found = sorted(root.rglob("*")) if root.is_dir() else [root]
@@ -345,7 +360,9 @@ def convert(
         except BaseException:
             file.unlink()
             raise
-    return load_transitions(data)
+    stored = load_transitions(data)
+    _warn_of_counterfactuals(source, stored, console)
+    return stored
 
 
 @contextmanager
@@ -415,6 +432,23 @@ def _convert(
         if Path(source).name in text:
             raise
         raise ValueError(f"{source}: {text}") from error
+
+
+def _warn_of_counterfactuals(source: str, data: TensorDict, console: Console) -> None:
+    """Warns of transitions that are not recordings: they would count as originals."""
+    path = _local(source)
+    if path is not None and (path / _META).exists():
+        data = load_transitions(path)
+    for key in (("caiac", "counterfactual"), ("info", "counterfactual")):
+        flags = data.get(key, None)
+        count = 0 if flags is None else int((flags != 0).sum())
+        if count:
+            console.warn(
+                f"{count} of {len(data)} transitions of {source} are counterfactual "
+                f"({key!r}): they are scored as if they had been recorded, and `caiac "
+                "augment` would count them as originals; score the dataset that they "
+                "were made from instead"
+            )
 
 
 def scored_folder(name: str) -> Path:
