@@ -191,6 +191,63 @@ def test_every_form_gives_the_rows_of_a_loop(
     assert {item.name for item in path.parent.iterdir()} == {"rows"}
 
 
+@pytest.mark.parametrize("of", ["parts", "episodes"])
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy, np.ma.asarray])
+def test_a_stream_may_reuse_its_arrays(of, kind, tmp_path):
+    steps = np.arange(20)[:, None]
+    arrays = {
+        "observations": {"state": steps + 0.5},
+        "actions": steps + 0.25,
+        "next_observations": {"state": steps + 1.5},
+    }
+    if of == "parts":
+        arrays["timeouts"] = (steps % 7 == 6) | (steps == 19)
+
+    def stream(reuse):
+        empty = {name: np.zeros((5, 1)) for name in ("now", "action", "next", "end")}
+        for start in range(0, 20, 5):
+            here = empty if reuse else {k: v.copy() for k, v in empty.items()}
+            own = slice(start, start + 5)
+            here["now"][:] = arrays["observations"]["state"][own]
+            here["action"][:] = arrays["actions"][own]
+            here["next"][:] = arrays["next_observations"]["state"][own]
+            item = {
+                "observations": {"state": kind(here["now"])},
+                "actions": kind(here["action"]),
+                "next_observations": {"state": kind(here["next"])},
+            }
+            if of == "parts":
+                here["end"][:] = arrays["timeouts"][own]
+                item["timeouts"] = here["end"]
+            yield item
+
+    data = from_stream(stream(True), tmp_path / "a", of=of, progress=False)
+    assert np.array_equal(data["action"].numpy(), arrays["actions"])
+    assert np.array_equal(
+        data["next", "observation", "state"].numpy(),
+        arrays["next_observations"]["state"],
+    )
+    fresh = from_stream(stream(False), tmp_path / "b", of=of, progress=False)
+    assert (data == fresh).all()
+
+
+def test_masked_values_in_the_rest_of_a_part_are_refused(tmp_path):
+    def stream(masked):
+        for start in (0, 3):
+            rows = np.arange(start, start + 3.0)[:, None]
+            yield {
+                "observations": np.ma.masked_equal(rows, masked),
+                "actions": rows,
+                "next_observations": rows + 1,
+                "timeouts": rows == 5,
+            }
+
+    assert len(from_stream(stream(9), tmp_path / "a", of="parts", progress=False)) == 6
+    for masked in (2, 4):
+        with pytest.raises(ValueError, match=r"'observation' in .* has masked values"):
+            from_stream(stream(masked), tmp_path / "b", of="parts", progress=False)
+
+
 class TestKindsOfArrays:
     def test_tensors_maps_and_hdf5(self, tmp_path):
         rng = np.random.default_rng(0)

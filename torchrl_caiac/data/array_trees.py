@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "check_arrays",
+    "copied",
     "cut",
     "entries",
     "episode_list",
@@ -92,6 +93,29 @@ def cut(tree: Any, rows: slice) -> Any:
     return tree[rows]
 
 
+def copied(tree: Any) -> Any:
+    """Returns a copy of an array, or of all arrays of a nested mapping, on the CPU.
+
+    Args:
+        tree (array or mapping of str to tree, optional): arrays ``[T, ...]``.
+
+    Returns:
+        numpy.ndarray or dict: the copy; ``None`` for ``None``.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_caiac.data.array_trees import copied
+        >>> copied({"a": np.arange(2)})
+        {'a': array([0, 1])}
+    """
+    if tree is None:
+        return None
+    if isinstance(tree, Mapping):
+        return {key: copied(value) for key, value in tree.items()}
+    # Masks are kept: masked values are refused later.
+    return tree.copy() if isinstance(tree, np.ma.MaskedArray) else to_numpy(tree).copy()
+
+
 def joined(before: Any, after: Any) -> Any:
     """Returns the rows of one tree followed by those of another.
 
@@ -122,11 +146,15 @@ def joined(before: Any, after: Any) -> Any:
         return {key: joined(before[key], after[key]) for key in before}
     if isinstance(before, Mapping) or isinstance(after, Mapping):
         raise ValueError("a mapping is followed by an array, or an array by a mapping")
-    arrays = to_numpy(before), to_numpy(after)
+    arrays = [
+        part if isinstance(part, np.ma.MaskedArray) else to_numpy(part)
+        for part in (before, after)
+    ]
     if arrays[0].shape[1:] != arrays[1].shape[1:] or arrays[0].dtype != arrays[1].dtype:
         kinds = [f"{array.dtype} {list(array.shape)}" for array in arrays]
         raise ValueError(f"{kinds[0]} is followed by {kinds[1]}")
-    return np.concatenate(arrays)
+    has_mask = any(isinstance(array, np.ma.MaskedArray) for array in arrays)
+    return np.ma.concatenate(arrays) if has_mask else np.concatenate(arrays)
 
 
 def row_bytes(tree: Any) -> int:

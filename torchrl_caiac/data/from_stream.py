@@ -49,7 +49,8 @@ def from_stream(
     Args:
         stream (iterable of mapping): mappings with the arguments of
             :func:`from_arrays` for arrays: ``"observations"``, ``"actions"`` and, in
-            all mappings or in none, the others. Each is read once.
+            all mappings or in none, the others. Each is read once, before the next
+            one is asked for, so that a stream may reuse its arrays.
         path (path): the folder to write. It is written atomically.
 
     Keyword Args:
@@ -163,7 +164,8 @@ def _from_parts(parts: Iterable[ArraySet], lost: LostRows) -> Iterator[Part]:
         if stop:
             spans = FlatArrays(part.cut(slice(0, stop)), f"the stream from row {first}")
             yield from spans.parts(lost)
-        rest = part.cut(slice(stop, None)) if stop < len(ends) else None
+        # Copied, because the stream may write its next part to the same arrays.
+        rest = part.cut(slice(stop, None)).copied() if stop < len(ends) else None
         first += stop
     if rest is not None:
         raise ValueError(
