@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import is_tensor_collection
 
 __all__ = [
     "check_arrays",
@@ -18,6 +19,7 @@ __all__ = [
     "episode_list",
     "is_floating",
     "joined",
+    "plain_tree",
     "row_bytes",
     "to_numpy",
     "with_goals",
@@ -47,6 +49,34 @@ def to_numpy(value: Any) -> NDArray[Any]:
         return np.asarray(value)
     except ValueError:  # lists of different lengths
         return np.empty(0, object)
+
+
+def plain_tree(tree: Any) -> Any:
+    """Returns tensordicts as nested mappings, and everything else as it is.
+
+    Args:
+        tree (tree or list of trees): arrays, mappings and tensordicts ``[T]``.
+
+    Returns:
+        tree or list of trees: the same without tensordicts. No array is copied.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.array_trees import plain_tree
+        >>> plain_tree([TensorDict({"a": torch.zeros(2)}, [2])])
+        [{'a': tensor([0., 0.])}]
+    """
+    if is_tensor_collection(tree):
+        # Not to_dict(), which would give the data of entries that are not tensors.
+        return {key: plain_tree(tree.get(key)) for key in tree.keys()}  # noqa: SIM118
+    if isinstance(tree, Mapping):
+        return {key: plain_tree(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)) and any(
+        isinstance(item, Mapping) or is_tensor_collection(item) for item in tree
+    ):
+        return [plain_tree(item) for item in tree]
+    return tree
 
 
 def is_floating(value: Any) -> bool:
@@ -303,7 +333,7 @@ def _episode(item: Any, name: str) -> Any:
     if isinstance(item, Mapping):
         return item
     array = item if hasattr(item, "shape") else to_numpy(item)
-    if not len(array.shape) or getattr(array.dtype, "kind", "") in "OUS":
+    if not len(array.shape) or getattr(array.dtype, "kind", "") in {"O", "U", "S"}:
         raise ValueError(
             f"{name} is a {type(item).__name__}, expected the array of one episode: a "
             "list has one array for each episode; for flat arrays, convert the list "

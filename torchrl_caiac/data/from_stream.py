@@ -21,6 +21,7 @@ from torchrl_caiac.data.array_trees import (
     check_arrays,
     entries,
     joined,
+    plain_tree,
     to_numpy,
     with_goals,
 )
@@ -105,6 +106,7 @@ def _items(stream: Iterable[Mapping[str, Any]]) -> Iterator[ArraySet]:
     expected: set[str] | None = None
     for number, item in enumerate(stream):
         where = f"item {number} of the stream"
+        item = plain_tree(item)
         if not isinstance(item, Mapping):
             raise ValueError(
                 f"{where} is a {type(item).__name__}, expected a mapping with the "
