@@ -14,9 +14,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
 from tests.killing import run_killed
 from torchrl_caiac import EntityLayout
+from torchrl_caiac import data as loaders
 from torchrl_caiac.data import (
     action_bounds,
     array_parts,
@@ -109,8 +111,32 @@ def ends_of(episodes, how):
     }[how]
 
 
-def write(form, how, episodes, path, cuts=()):
+def as_kind(value, kind):
+    """The same arrays in NumPy, in torch, or also with tensordicts as mappings."""
+    if kind == "numpy":
+        return value
+    if isinstance(value, list):
+        return [as_kind(item, kind) for item in value]
+    if isinstance(value, dict):
+        tree = {key: as_kind(item, kind) for key, item in value.items()}
+        return TensorDict(tree) if kind == "tensordict" else tree
+    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+
+
+def write(form, how, episodes, path, cuts=(), kind="numpy"):
     """Writes episodes in one of the forms of arrays."""
+
+    def from_arrays(*given, path, **named):
+        return loaders.from_arrays(
+            *(as_kind(value, kind) for value in given),
+            path=path,
+            **{name: as_kind(value, kind) for name, value in named.items()},
+        )
+
+    def from_stream(stream, path, **named):
+        items = ({k: as_kind(v, kind) for k, v in item.items()} for item in stream)
+        return loaders.from_stream(items, path, **named)
+
     names = ("actions", "rewards")
     rest = {"progress": False, "action_bounds": ([-9, -9], [9, 9])}
     if form.startswith("list"):
@@ -169,9 +195,10 @@ FORMS = [
     seed=st.integers(0, 99),
     chunk=st.sampled_from([1, 150, 1 << 20]),
     cuts=st.lists(st.integers(0, 12)),
+    kind=st.sampled_from(["numpy", "torch", "tensordict"]),
 )
 def test_every_form_gives_the_rows_of_a_loop(
-    form, how, lengths, seed, chunk, cuts, tmp_path_factory
+    form, how, lengths, seed, chunk, cuts, kind, tmp_path_factory
 ):
     if form == "flat, alone":
         lengths = [length + 1 for length in lengths]
@@ -182,13 +209,70 @@ def test_every_form_gives_the_rows_of_a_loop(
     path = tmp_path_factory.mktemp("arrays") / "rows"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(array_parts, "_CHUNK", chunk)
-        data = write(form, how, episodes, path, cuts)
+        data = write(form, how, episodes, path, cuts, kind)
     assert_rows(data, oracle(episodes, lose_last=form == "flat, alone"))
     assert_rows(load_transitions(path, verify=True), oracle(episodes, form == FORMS[4]))
     assert torch.equal(action_bounds(path)[1], torch.tensor([9.0, 9.0]))
-    again = write(form, how, episodes, path, cuts)
+    again = write(form, how, episodes, path, cuts, kind)
     assert (again == data).all()
     assert {item.name for item in path.parent.iterdir()} == {"rows"}
+
+
+@pytest.mark.parametrize("of", ["parts", "episodes"])
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy, np.ma.asarray])
+def test_a_stream_may_reuse_its_arrays(of, kind, tmp_path):
+    steps = np.arange(20)[:, None]
+    arrays = {
+        "observations": {"state": steps + 0.5},
+        "actions": steps + 0.25,
+        "next_observations": {"state": steps + 1.5},
+    }
+    if of == "parts":
+        arrays["timeouts"] = (steps % 7 == 6) | (steps == 19)
+
+    def stream(reuse):
+        empty = {name: np.zeros((5, 1)) for name in ("now", "action", "next", "end")}
+        for start in range(0, 20, 5):
+            here = empty if reuse else {k: v.copy() for k, v in empty.items()}
+            own = slice(start, start + 5)
+            here["now"][:] = arrays["observations"]["state"][own]
+            here["action"][:] = arrays["actions"][own]
+            here["next"][:] = arrays["next_observations"]["state"][own]
+            item = {
+                "observations": {"state": kind(here["now"])},
+                "actions": kind(here["action"]),
+                "next_observations": {"state": kind(here["next"])},
+            }
+            if of == "parts":
+                here["end"][:] = arrays["timeouts"][own]
+                item["timeouts"] = here["end"]
+            yield item
+
+    data = from_stream(stream(True), tmp_path / "a", of=of, progress=False)
+    assert np.array_equal(data["action"].numpy(), arrays["actions"])
+    assert np.array_equal(
+        data["next", "observation", "state"].numpy(),
+        arrays["next_observations"]["state"],
+    )
+    fresh = from_stream(stream(False), tmp_path / "b", of=of, progress=False)
+    assert (data == fresh).all()
+
+
+def test_masked_values_in_the_rest_of_a_part_are_refused(tmp_path):
+    def stream(masked):
+        for start in (0, 3):
+            rows = np.arange(start, start + 3.0)[:, None]
+            yield {
+                "observations": np.ma.masked_equal(rows, masked),
+                "actions": rows,
+                "next_observations": rows + 1,
+                "timeouts": rows == 5,
+            }
+
+    assert len(from_stream(stream(9), tmp_path / "a", of="parts", progress=False)) == 6
+    for masked in (2, 4):
+        with pytest.raises(ValueError, match=r"'observation' in .* has masked values"):
+            from_stream(stream(masked), tmp_path / "b", of="parts", progress=False)
 
 
 class TestKindsOfArrays:
@@ -247,6 +331,26 @@ class TestKindsOfArrays:
             for n in range(2)
         ]
         other = from_arrays(each, actions, tmp_path / "b", progress=False)
+        assert (data == other).all()
+        trees = [
+            TensorDict(
+                {
+                    "arm": torch.from_numpy(episode["arm"]),
+                    "cups": {"red": torch.from_numpy(episode["cups"]["red"])},
+                },
+                [len(episode["arm"])],
+            )
+            for episode in each
+        ]
+        other = from_arrays(trees, actions, tmp_path / "c", progress=False)
+        assert (data == other).all()
+        other = from_arrays(
+            torch.cat(trees),
+            np.concatenate(actions),
+            tmp_path / "d",
+            episode_lengths=[3, 4],
+            progress=False,
+        )
         assert (data == other).all()
 
     def test_goals(self, tmp_path):

@@ -345,6 +345,51 @@ class TestRefused:
             )
         assert not list(tmp_path.iterdir())
 
+    @pytest.mark.parametrize(
+        ("rows", "row", "follows"),
+        [
+            ([3, 1, 0, 2, 4, 5], 1, 0),
+            ([5, 4, 3, 2, 1, 0], 1, 0),
+            ([0, 1, 2, 4, 5], 3, 2),  # a gap
+            ([0, 1, 2, 3, 3, 4, 5], 4, 3),  # twice
+            ([0, 1, 2, 3, 4, 5, 0, 1], 6, 5),  # the id comes back
+        ],
+    )
+    @pytest.mark.parametrize("nested", [False, True])
+    def test_rows_that_do_not_follow_each_other(
+        self, rows, row, follows, nested, tmp_path
+    ):
+        data = transitions([6])
+        for name in ("terminated", "truncated", "done"):
+            data["next", name].zero_()
+        if nested:
+            for root in (data, data["next"]):
+                root["observation"] = TensorDict({"x": root["observation"]}, [6])
+        given = from_replay_buffer(data, tmp_path / "whole", progress=False)
+        assert len(given) == 6
+        with pytest.raises(
+            ValueError, match=f"row {row} of the source does not follow row {follows},"
+        ):
+            from_replay_buffer(data[torch.tensor(rows)], tmp_path / "a", progress=False)
+        assert not (tmp_path / "a").exists()
+
+    def test_an_id_that_comes_back(self, tmp_path):
+        data = transitions([6])
+        for name in ("terminated", "truncated", "done"):
+            data["next", name].zero_()
+        data["episode"] = torch.tensor([0, 0, 1, 1, 0, 0])
+        with pytest.raises(ValueError, match=r"row 4 .* does not follow row 1,"):
+            from_replay_buffer(data, tmp_path / "a", progress=False)
+        data["next", "done"][1] = data["next", "truncated"][1] = True
+        data = from_replay_buffer(data, tmp_path / "a", progress=False)
+        assert data["episode"].tolist() == [0, 0, 1, 1, 2, 2]
+
+    def test_a_gap_in_a_later_part_of_a_long_trajectory(self, tmp_path):
+        data = transitions([40_000])
+        data["next", "observation"][16_383] += 1  # the last row of a part
+        with pytest.raises(ValueError, match=r"row 16384 .* does not follow row 16383"):
+            from_replay_buffer(data, tmp_path / "a", progress=False)
+
     def test_sources(self, tmp_path):
         for source, error, match in (
             ([1, 2], TypeError, "is a list, expected a replay buffer"),
@@ -367,10 +412,26 @@ class TestRefused:
         )
         assert "log_prob" not in data["info"]
         rows["observation"] += 1
+        rows["next", "observation"] += 1
         with pytest.raises(FileExistsError, match=r"'observation'.*overwrite=True"):
             from_replay_buffer(
                 rows, tmp_path / "a", exclude=["name", "log_prob"], progress=False
             )
+
+
+def test_rounding_and_goals_of_hindsight_are_no_gaps(tmp_path):
+    rows = transitions([5, 3])
+    rows["next", "observation"] = rows["next", "observation"].half().double()
+    rows["observation"] = rows["observation"].half()
+    rows["desired_goal"], rows["next", "desired_goal"] = torch.rand(2, 8, 2)
+    assert len(from_replay_buffer(rows, tmp_path / "a", progress=False)) == 8
+    for root in (rows, rows["next"]):
+        names = ("observation", "desired_goal")
+        root["state"] = root.select(*names)
+    data = from_replay_buffer(
+        rows, tmp_path / "b", observation_key="state", progress=False
+    )
+    assert len(data) == 8
 
 
 def test_long_trajectories_are_read_in_parts(tmp_path, caplog):

@@ -11,6 +11,7 @@ import numpy as np
 
 from torchrl_caiac.data.array_trees import (
     check_arrays,
+    copied,
     cut,
     entries,
     episode_list,
@@ -56,6 +57,10 @@ class ArraySet:
         return ArraySet(
             **{name: cut(value, rows) for name, value in self.given().items()}
         )
+
+    def copied(self) -> ArraySet:
+        """Returns copies of all arrays."""
+        return ArraySet(**{name: copied(value) for name, value in self.given().items()})
 
     def episodes(self) -> list[ArraySet]:
         """Returns the arrays of each episode, of lists."""

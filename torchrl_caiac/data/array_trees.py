@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import is_tensor_collection
 
 __all__ = [
     "check_arrays",
+    "copied",
     "cut",
     "entries",
     "episode_list",
     "is_floating",
     "joined",
+    "plain_tree",
     "row_bytes",
     "to_numpy",
     "with_goals",
@@ -46,6 +49,34 @@ def to_numpy(value: Any) -> NDArray[Any]:
         return np.asarray(value)
     except ValueError:  # lists of different lengths
         return np.empty(0, object)
+
+
+def plain_tree(tree: Any) -> Any:
+    """Returns tensordicts as nested mappings, and everything else as it is.
+
+    Args:
+        tree (tree or list of trees): arrays, mappings and tensordicts ``[T]``.
+
+    Returns:
+        tree or list of trees: the same without tensordicts. No array is copied.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.array_trees import plain_tree
+        >>> plain_tree([TensorDict({"a": torch.zeros(2)}, [2])])
+        [{'a': tensor([0., 0.])}]
+    """
+    if is_tensor_collection(tree):
+        # Not to_dict(), which would give the data of entries that are not tensors.
+        return {key: plain_tree(tree.get(key)) for key in tree.keys()}  # noqa: SIM118
+    if isinstance(tree, Mapping):
+        return {key: plain_tree(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)) and any(
+        isinstance(item, Mapping) or is_tensor_collection(item) for item in tree
+    ):
+        return [plain_tree(item) for item in tree]
+    return tree
 
 
 def is_floating(value: Any) -> bool:
@@ -92,6 +123,29 @@ def cut(tree: Any, rows: slice) -> Any:
     return tree[rows]
 
 
+def copied(tree: Any) -> Any:
+    """Returns a copy of an array, or of all arrays of a nested mapping, on the CPU.
+
+    Args:
+        tree (array or mapping of str to tree, optional): arrays ``[T, ...]``.
+
+    Returns:
+        numpy.ndarray or dict: the copy; ``None`` for ``None``.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_caiac.data.array_trees import copied
+        >>> copied({"a": np.arange(2)})
+        {'a': array([0, 1])}
+    """
+    if tree is None:
+        return None
+    if isinstance(tree, Mapping):
+        return {key: copied(value) for key, value in tree.items()}
+    # Masks are kept: masked values are refused later.
+    return tree.copy() if isinstance(tree, np.ma.MaskedArray) else to_numpy(tree).copy()
+
+
 def joined(before: Any, after: Any) -> Any:
     """Returns the rows of one tree followed by those of another.
 
@@ -122,11 +176,15 @@ def joined(before: Any, after: Any) -> Any:
         return {key: joined(before[key], after[key]) for key in before}
     if isinstance(before, Mapping) or isinstance(after, Mapping):
         raise ValueError("a mapping is followed by an array, or an array by a mapping")
-    arrays = to_numpy(before), to_numpy(after)
+    arrays = [
+        part if isinstance(part, np.ma.MaskedArray) else to_numpy(part)
+        for part in (before, after)
+    ]
     if arrays[0].shape[1:] != arrays[1].shape[1:] or arrays[0].dtype != arrays[1].dtype:
         kinds = [f"{array.dtype} {list(array.shape)}" for array in arrays]
         raise ValueError(f"{kinds[0]} is followed by {kinds[1]}")
-    return np.concatenate(arrays)
+    has_mask = any(isinstance(array, np.ma.MaskedArray) for array in arrays)
+    return np.ma.concatenate(arrays) if has_mask else np.concatenate(arrays)
 
 
 def row_bytes(tree: Any) -> int:
@@ -275,7 +333,7 @@ def _episode(item: Any, name: str) -> Any:
     if isinstance(item, Mapping):
         return item
     array = item if hasattr(item, "shape") else to_numpy(item)
-    if not len(array.shape) or getattr(array.dtype, "kind", "") in "OUS":
+    if not len(array.shape) or getattr(array.dtype, "kind", "") in {"O", "U", "S"}:
         raise ValueError(
             f"{name} is a {type(item).__name__}, expected the array of one episode: a "
             "list has one array for each episode; for flat arrays, convert the list "

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
 
-from torchrl_caiac.data.array_trees import cut, to_numpy
+from torchrl_caiac.data.array_trees import cut, plain_tree, to_numpy
 
 __all__ = ["episode_transitions"]
 
@@ -53,6 +53,7 @@ def episode_transitions(
     Args:
         observations (array or mapping of str to arrays): ``[L + 1, ...]``, the states
             before and after each action; or ``[L, ...]`` with ``next_observations``.
+            Here and below, a tensordict counts as a mapping.
         actions (array or mapping of str to arrays): ``[L, ...]``.
 
     Keyword Args:
@@ -101,6 +102,8 @@ def episode_transitions(
         tensor([False, False,  True])
     """
     reader = _Reader(where, remove, leave_out)
+    observations, actions = plain_tree(observations), plain_tree(actions)
+    next_observations, info = plain_tree(next_observations), plain_tree(info)
     action = reader.arrays({"action": actions})
     length = _length(action["action"])
     if not length:

@@ -15,7 +15,7 @@ from torchrl_caiac.data.array_parts import (
     episode_parts,
     next_states,
 )
-from torchrl_caiac.data.array_trees import episode_list, with_goals
+from torchrl_caiac.data.array_trees import episode_list, plain_tree, with_goals
 from torchrl_caiac.data.write_episodes import Part, write_episodes
 
 __all__ = ["from_arrays"]
@@ -46,7 +46,7 @@ def from_arrays(
     Each argument is an array or a nested mapping of arrays. An array is a NumPy array,
     also a memory-mapped one, a tensor, an HDF5 dataset, or anything else that has a
     shape and can be sliced. It is read in parts, so it may be larger than the memory.
-    There are two forms:
+    A tensordict counts as a mapping. There are two forms:
 
     - **a list with one array for each episode**, for everything. (Or a mapping of such
       lists.)
@@ -138,6 +138,8 @@ def from_arrays(
         998
         >>> folder.cleanup()
     """
+    observations, actions = plain_tree(observations), plain_tree(actions)
+    next_observations = plain_tree(next_observations)
     given = ArraySet(
         observations=with_goals(observations, achieved_goals, desired_goals),
         actions=actions,
@@ -148,7 +150,7 @@ def from_arrays(
         terminals=terminals,
         timeouts=timeouts,
         dones=dones,
-        info=info,
+        info=plain_tree(info),
     )
     lost = LostRows()
     if episode_list(actions, "actions") is None:

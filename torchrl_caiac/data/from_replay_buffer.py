@@ -30,6 +30,8 @@ __all__ = ["from_replay_buffer"]
 _logger = logging.getLogger("torchrl_caiac.data.from_replay_buffer")
 
 _FLAGS = ("done", "terminated", "truncated")
+# Hindsight changes them row by row.
+_GOALS = ("achieved_goal", "desired_goal")
 _CHUNK = 1 << 14  # rows that are read at a time
 # torch cannot subtract unsigned integers of more than one byte, or write to some rows.
 _WIDER = {torch.uint16: torch.int32, torch.uint32: torch.int64}
@@ -63,6 +65,10 @@ def from_replay_buffer(
       trajectory is done; it counts as truncated if the source has no flag for it. If
       the source has only ``done``, it counts as terminated, as in TorchRL;
     - the other entries of the root, unchanged, under ``"info"``.
+
+    The rows of a trajectory must follow each other: the next observation of a row is
+    the observation of the row after it, up to rounding. Goals may differ, as hindsight
+    changes them row by row.
 
     Transforms of the buffer are not applied. A second call with the same data opens the
     folder.
@@ -112,9 +118,9 @@ def from_replay_buffer(
         OSError: the disk is full.
         TypeError: ``source`` is none of the above, or has something else than
             tensordicts.
-        ValueError: the source is empty; is not in the order of time; has transitions of
-            several steps, padded trajectories, zeros only, NaN or infinite values,
-            texts or objects; or its flags are contradictory.
+        ValueError: the source is empty; has rows that do not follow each other,
+            transitions of several steps, padded trajectories, zeros only, NaN or
+            infinite values, texts or objects; or its flags are contradictory.
 
     Examples:
         >>> import tempfile
@@ -164,6 +170,7 @@ def from_replay_buffer(
     order = index.rows(torch.arange(length, device=index.device)).cpu()
     ends = torch.zeros(length, dtype=torch.bool)
     ends[index.ends.cpu()] = True
+    _check_order(data, keys.observation, order, ends)
     if unknown_next == "drop":
         unknown = _unknown(data, keys.observation, order, ends)
         if unknown.any():
@@ -289,6 +296,55 @@ def _nonzero(value: Any) -> torch.Tensor:
             found |= _nonzero(leaf)
         return found
     return (value.as_subclass(torch.Tensor) != 0).reshape(len(value), -1).any(1).cpu()
+
+
+def _check_order(
+    data: TensorDictBase, key: NestedKey, order: torch.Tensor, ends: torch.Tensor
+) -> None:
+    """Raises if the observation after a row is not that of the row that follows."""
+    next_key: NestedKey = ("next", *path_of(key))
+    before = (~ends[:-1]).nonzero().squeeze(-1)  # places by time
+    for start in range(0, len(before), _CHUNK):
+        places = before[start : start + _CHUNK]
+        rows, following = order[places], order[places + 1]
+        after = _taken(data.select(next_key), rows).get(next_key)
+        now = _taken(data.select(key), following).get(key)
+        # Zeros are what some datasets have where the next observation is unknown.
+        wrong = _differs(after, now) & _nonzero(after)
+        if wrong.any():
+            found = int(wrong.nonzero()[0])
+            raise ValueError(
+                f"row {int(following[found])} of the source does not follow row "
+                f"{int(rows[found])}, although both are in one trajectory: the next "
+                f"{key!r} of the one is not the {key!r} of the other; give the rows of "
+                "each trajectory in the order of time and without gaps, and what does "
+                "not belong together different ids or an end flag (trajectory_key=, "
+                "done_key=)"
+            )
+
+
+def _differs(after: Any, now: Any) -> torch.Tensor:
+    """Returns which rows differ by more than rounding, bool ``[T]``, on the CPU."""
+    if isinstance(after, TensorDictBase):
+        wrong = torch.zeros(len(after), dtype=torch.bool)
+        for name, leaf in after.items(True, True):
+            value = now.get(name, None)
+            if value is not None and path_of(name)[-1] not in _GOALS:
+                wrong |= _differs(leaf, value)
+        return wrong
+    after, now = _plain(after), _plain(now)
+    wrong = torch.zeros(len(after), dtype=torch.bool)
+    if after.shape != now.shape:
+        return wrong  # the writer says so
+    rows = (after != now).reshape(len(after), -1).any(1).nonzero().squeeze(-1)
+    if not len(rows):
+        return wrong
+    kinds = [x.dtype for x in (after, now) if x.is_floating_point()]
+    rounding = max([2 * torch.finfo(kind).eps for kind in kinds] + [1e-6])
+    a, b = after[rows].double(), now[rows].double()
+    far = (a - b).abs() > rounding * (0.1 + a.abs() + b.abs())
+    wrong[rows] = far.reshape(len(rows), -1).any(1)  # NaN has an error of its own
+    return wrong
 
 
 def _unknown(

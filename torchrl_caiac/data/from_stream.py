@@ -21,6 +21,7 @@ from torchrl_caiac.data.array_trees import (
     check_arrays,
     entries,
     joined,
+    plain_tree,
     to_numpy,
     with_goals,
 )
@@ -49,7 +50,8 @@ def from_stream(
     Args:
         stream (iterable of mapping): mappings with the arguments of
             :func:`from_arrays` for arrays: ``"observations"``, ``"actions"`` and, in
-            all mappings or in none, the others. Each is read once.
+            all mappings or in none, the others. Each is read once, before the next
+            one is asked for, so that a stream may reuse its arrays.
         path (path): the folder to write. It is written atomically.
 
     Keyword Args:
@@ -104,6 +106,7 @@ def _items(stream: Iterable[Mapping[str, Any]]) -> Iterator[ArraySet]:
     expected: set[str] | None = None
     for number, item in enumerate(stream):
         where = f"item {number} of the stream"
+        item = plain_tree(item)
         if not isinstance(item, Mapping):
             raise ValueError(
                 f"{where} is a {type(item).__name__}, expected a mapping with the "
@@ -163,7 +166,8 @@ def _from_parts(parts: Iterable[ArraySet], lost: LostRows) -> Iterator[Part]:
         if stop:
             spans = FlatArrays(part.cut(slice(0, stop)), f"the stream from row {first}")
             yield from spans.parts(lost)
-        rest = part.cut(slice(stop, None)) if stop < len(ends) else None
+        # Copied, because the stream may write its next part to the same arrays.
+        rest = part.cut(slice(stop, None)).copied() if stop < len(ends) else None
         first += stop
     if rest is not None:
         raise ValueError(
