@@ -133,10 +133,24 @@ def test_the_area_is_that_of_all_pairs() -> None:
     assert split_scores(scores, motion).area == pytest.approx(wins)
 
 
-def test_what_never_moves_is_never_influenced() -> None:
-    scores, _ = mixture()
+@pytest.mark.parametrize("apart", [0.0, 0.5])
+def test_what_never_moves_is_never_influenced(apart: float) -> None:
+    scores, _ = mixture(apart=apart)
     split = split_scores(scores, np.full(1000, RESTS, np.int8))
     assert split.confidence == NEVER and "never moves in 1000 rows" in split.reason
+
+
+def test_what_never_moves_may_be_in_reach_in_an_upper_mode() -> None:
+    scores, _ = mixture(4000, 1000)
+    split = split_scores(scores, np.full(5000, RESTS, np.int8))
+    assert split.confidence == UNCLEAR
+    assert "it never moves in 5000 rows" in split.reason
+    assert split.threshold == split_scores(scores).threshold
+
+
+def test_zeros_do_not_rule_out_influence_where_there_is_doubt() -> None:
+    split = split_scores(np.zeros(500), doubt="its state changes")
+    assert split.confidence == UNCLEAR and "its state changes" in split.reason
 
 
 def test_one_unclear_row_is_not_never() -> None:

@@ -79,6 +79,27 @@ def test_without_positions_modes_that_are_near_are_unclear_and_never_swapped() -
     assert not swapped.any()
 
 
+def test_zeros_without_positions_are_unclear_unless_the_entity_rests() -> None:
+    data = world()
+    data["caiac", "score"][:] = 0.0
+    data["next", "observation"][:, 2] += 0.005  # the noise of the lid
+    columns = {"arm": [0], "cup": [1], "lid": [2]}
+    unknown = EntityLayout(columns, fixed=["arm"])
+    found = suggest_thresholds(data, unknown)
+    assert found.confidence == {"cup": "unclear", "lid": "unclear"}
+    assert "its state changes" in found.reasons["cup"] and found.free["cup"] == 0
+    found = suggest_thresholds(
+        data, EntityLayout(columns, fixed=["arm"], variance_floor=0.01)
+    )
+    assert found.confidence == {
+        "cup": "unclear",
+        "lid": "one mode: never influenced",
+    }
+    found = suggest_thresholds(data.exclude("next"), unknown)
+    assert set(found.confidence.values()) == {"unclear"}
+    assert "are missing" in found.reasons["lid"]
+
+
 def test_never_is_below_negative_scores_too() -> None:
     data = world()
     layout = EntityLayout({"arm": [0], "cup": [1], "lid": [2]}, fixed=["arm"])
@@ -214,7 +235,7 @@ def test_as_text_and_json() -> None:
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 def test_the_figure(tmp_path, suffix: str) -> None:
     data = world()
-    data["caiac", "score"][:100, 2] = 0.0
+    data["caiac", "score"][:5, 2] = 0.0
     found = suggest_thresholds(data, LAYOUT)
     figure = found.figure()
     titles = [axes.get_title(loc="left") for axes in figure.axes]

@@ -235,12 +235,54 @@ def test_the_choice_is_saved_and_pickled() -> None:
     other.load_state_dict(one.state_dict())
     assert copy.thresholds == other.thresholds == one.thresholds
     assert other(rows())["caiac", "swapped"].any()  # no buffer is needed
-    number = CAIACTransform(LAYOUT, 0.3)
-    number.load_state_dict(one.state_dict())  # keeps its own
-    assert number.thresholds == {"cup": 0.3, "lid": 0.3}
-    foreign = CAIACTransform(EntityLayout({"cup": [0]}), "auto")
-    with pytest.raises(ValueError, match="2 thresholds, the layout has 1"):
-        foreign.load_state_dict(one.state_dict())
+
+
+def chosen_state() -> tuple[dict[str, float], dict]:
+    """The thresholds that ``"auto"`` chose, and the state that has them."""
+    rb = buffer(rows())
+    transform = CAIACTransform(LAYOUT, "auto", generator=torch.Generator())
+    rb.append_transform(transform)
+    rb.sample()
+    return transform.thresholds, transform.state_dict()
+
+
+def test_the_choice_is_loaded_by_name() -> None:
+    numbers, state = chosen_state()
+    layout = EntityLayout({"arm": [0], "lid": [2], "cup": [1]}, fixed=["arm"])
+    other = CAIACTransform(layout, "auto")
+    other.load_state_dict(state)
+    assert other.thresholds == numbers and list(other.thresholds) == ["lid", "cup"]
+    same = CAIACTransform(LAYOUT, numbers)
+    same.load_state_dict(state)
+    assert same.thresholds == numbers
+
+
+@pytest.mark.parametrize(
+    ("columns", "threshold", "message"),
+    [
+        ({"cup": [0]}, "auto", r"of \['cup', 'lid'\], but .* are \['cup'\]"),
+        ({"mug": [1], "lid": [2]}, "auto", "it is of another layout"),
+        ({"cup": [1], "lid": [2]}, 0.3, "this transform has threshold=0.3"),
+        ({"cup": [1], "lid": [2]}, {"cup": 1, "lid": 1}, "create it with threshold="),
+    ],
+)
+def test_the_choice_of_others_is_refused(columns, threshold, message) -> None:
+    _, state = chosen_state()
+    other = CAIACTransform(
+        EntityLayout(columns), threshold, generator=torch.Generator().manual_seed(7)
+    )
+    before, generator = other.thresholds, other.generator.get_state()
+    with pytest.raises(ValueError, match=message):
+        other.load_state_dict(state)
+    assert other.thresholds == before
+    assert torch.equal(other.generator.get_state(), generator)
+
+
+def test_a_choice_without_names_is_refused() -> None:
+    _, state = chosen_state()
+    del state["_extra_state"]["threshold_names"]
+    with pytest.raises(ValueError, match="of an earlier version"):
+        CAIACTransform(LAYOUT, "auto").load_state_dict(state)
 
 
 def test_auto_needs_a_buffer() -> None:

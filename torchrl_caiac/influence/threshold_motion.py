@@ -17,6 +17,7 @@ from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = [
     "SampledRows",
+    "doubt_of_zeros",
     "motion_of_rows",
     "position_tolerances",
     "sample_blocks",
@@ -203,6 +204,49 @@ def motion_of_rows(
     return dict(zip(tolerances, motion.flatten(0, 1).unbind(-1), strict=True))
 
 
+def doubt_of_zeros(
+    data: TensorDictBase, layout: EntityLayout, rows: torch.Tensor, name: str
+) -> str | None:
+    """Returns why an entity could be influenced although all of its scores are 0.
+
+    Args:
+        data (TensorDictBase): transitions ``[T]``.
+        layout (EntityLayout): the entities.
+        rows (torch.Tensor): int64 ``[n]``, the rows to look at.
+        name (str): an entity whose positions are unknown.
+
+    Returns:
+        str, optional: the reason: a column changes by more than the layout's
+        ``variance_floor`` (at all, if there is none), or the states are missing;
+        ``None`` if it always rests.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.influence.threshold_motion import doubt_of_zeros
+        >>> data = TensorDict({
+        ...     "observation": torch.zeros(2, 2),
+        ...     ("next", "observation"): torch.tensor([[0.0, 0.0], [0.0, 0.1]])}, [2])
+        >>> layout = EntityLayout({"cup": [0], "lid": [1]})
+        >>> doubt_of_zeros(data, layout, torch.arange(2), "cup")
+        >>> doubt_of_zeros(data, layout, torch.arange(2), "lid")
+        'its state changes'
+    """
+    keys = [*layout.in_keys, *(layout.next(key) for key in layout.in_keys)]
+    missing = [key for key in keys if data.get(key, None) is None]
+    if missing:
+        return f"{missing} are missing, so that it is not known to rest"
+    for part in rows.split(_CHUNK):
+        td = _read(data, layout, part)
+        change = layout.read(td, next=True).double() - layout.read(td).double()
+        own = change[:, layout.slices(td)[name]].abs().cpu()
+        floor = torch.tensor(layout.variance_floor.get(name, 0.0)).double()
+        if not bool((own <= floor).all()):
+            return "its state changes"
+    return None
+
+
 def without_near_rests(motion: torch.Tensor) -> torch.Tensor:
     """Returns motion without the rows at rest just before or after motion.
 
@@ -240,10 +284,7 @@ def _changes(
     tolerances: Mapping[str, torch.Tensor],
 ) -> torch.Tensor:
     """Returns the largest change of each entity in tolerances, ``[n, E]``."""
-    device = data.device or next(iter(data.values(True, True))).device
-    part = data.select(*layout.in_keys, *(layout.next(key) for key in layout.in_keys))[
-        rows.to(device)
-    ]
+    part = _read(data, layout, rows)
     change = layout.read(part, next=True).double() - layout.read(part).double()
     slices = layout.slices(part)
     found = []
@@ -252,6 +293,15 @@ def _changes(
         size = change[:, torch.tensor(places, device=change.device)].abs().cpu()
         found.append((size / tolerance).amax(-1))
     return torch.stack(found, -1)
+
+
+def _read(
+    data: TensorDictBase, layout: EntityLayout, rows: torch.Tensor
+) -> TensorDictBase:
+    """Returns the states and the next states of some rows."""
+    device = data.device or next(iter(data.values(True, True))).device
+    part = data.select(*layout.in_keys, *(layout.next(key) for key in layout.in_keys))
+    return part[rows.to(device)]
 
 
 def _with_later(

@@ -66,6 +66,8 @@ def split_scores(
     scores: NDArray[np.float64],
     motion: NDArray[np.int8] | None = None,
     why_unknown: str = "its positions are unknown",
+    *,
+    doubt: str | None = None,
 ) -> Split:
     """Splits the scores of one entity.
 
@@ -79,6 +81,10 @@ def split_scores(
         motion (numpy.ndarray, optional): int8 ``[n]``, :data:`MOVES` where the entity
             moves in the recorded transition, :data:`RESTS` where it does not.
         why_unknown (str): the reason why ``motion`` is ``None``.
+
+    Keyword Args:
+        doubt (str, optional): why scores of 0 do not mean that the entity is never
+            influenced, where ``motion`` is ``None``. Defaults to ``None``: they do.
 
     Returns:
         Split: the threshold, and how clear it is.
@@ -105,13 +111,24 @@ def split_scores(
     if motion is None:
         if not equal:
             return _by_scores(scores, threshold, why_unknown)
-        if scores.max() <= 0:
-            return Split(threshold, "one mode: never influenced", equal, area)
-        return Split(threshold, "unclear", f"{equal}, and {why_unknown}", area)
+        if scores.max() > 0:
+            return Split(threshold, "unclear", f"{equal}, and {why_unknown}", area)
+        if doubt is not None:
+            reason = f"{equal}, but {doubt}, and {why_unknown}"
+            return Split(threshold, "unclear", reason, area)
+        return Split(threshold, "one mode: never influenced", equal, area)
     moves, rests = scores[motion == MOVES], scores[motion == RESTS]
     counts = f"{len(moves)} of {len(scores)} rows"
     if not (motion != RESTS).any():
         reason = f"it never moves in {len(scores)} rows"
+        # The agent may have been able to move it in the rows of an upper mode.
+        alone = None if equal else _by_scores(scores, threshold, reason)
+        if alone is not None and alone.confidence == "two clear modes":
+            reason = (
+                f"{alone.reason}: whether the agent could move it in the upper mode is "
+                "not known, so give its threshold"
+            )
+            return Split(threshold, "unclear", reason, area)
         return Split(threshold, "one mode: never influenced", reason, area)
     if equal:
         reason = f"{equal}, but it moves in {counts}"

@@ -25,6 +25,7 @@ from torchrl_caiac.influence.score_record import read_record
 from torchrl_caiac.influence.score_spread import UNKNOWN, score_limits
 from torchrl_caiac.influence.threshold_motion import (
     SampledRows,
+    doubt_of_zeros,
     motion_of_rows,
     position_tolerances,
     sample_blocks,
@@ -224,11 +225,13 @@ def suggest_thresholds(
     which it rests (apart from those just before and after motion, in which the agent
     may be able to move it). The split is kept if it separates both kinds of rows almost
     as well as the best threshold. Otherwise it is moved to the nearest threshold that
-    does. An entity that never moves counts as never influenced. If no threshold
-    separates them, for example because the estimator misses influence or the entity
-    moves by itself, the entity is never swapped.
+    does. An entity that never moves counts as never influenced, unless its scores have
+    two modes far apart: the agent may have been able to move it in the upper one. If no
+    threshold separates them, for example because the estimator misses influence or the
+    entity moves by itself, the entity is never swapped.
 
-    Without positions, the scores must have two modes far apart.
+    Without positions, the scores must have two modes far apart, or all be 0 while the
+    state of the entity never changes.
 
     Args:
         source (ReplayBuffer, TensorStorage or TensorDictBase): transitions with scores,
@@ -322,7 +325,12 @@ def suggest_thresholds(
         values = own[:, place]
         known = values < UNKNOWN
         moves = motion[name][used].numpy() if name in motion else None
-        split = split_scores(values[known], None if moves is None else moves[known])
+        doubt = None
+        if moves is None and values[known].max(initial=0) <= 0:
+            doubt = doubt_of_zeros(data, layout, rows, name)
+        split = split_scores(
+            values[known], None if moves is None else moves[known], doubt=doubt
+        )
         if second is not None:
             split = _compared(split, values, second[:, place], moves)
         confidence[name], reasons[name] = split.confidence, split.reason

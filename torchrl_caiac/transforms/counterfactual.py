@@ -259,20 +259,28 @@ class CounterfactualTransform(RandomTransform, ABC):
         self._unscored.share_memory_()
         return self
 
-    def get_extra_state(self) -> dict[str, torch.Tensor]:
+    def get_extra_state(self) -> dict[str, Any]:
         """Returns the state of the generator, and thresholds chosen by ``"auto"``."""
-        state = super().get_extra_state()
+        state: dict[str, Any] = super().get_extra_state()
         if self.threshold == "auto" and self._thresholds.is_known:
-            numbers = list(self.thresholds.values())
-            state["thresholds"] = torch.tensor(numbers, dtype=torch.float64)
+            numbers = self.thresholds
+            state["thresholds"] = torch.tensor(
+                list(numbers.values()), dtype=torch.float64
+            )
+            state["threshold_names"] = list(numbers)
         return state
 
-    def set_extra_state(self, state: dict[str, torch.Tensor]) -> None:
-        """Restores what :meth:`get_extra_state` returned."""
-        super().set_extra_state(state)
-        if self.threshold == "auto" and "thresholds" in state:
-            self._thresholds.restore(state["thresholds"])
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`get_extra_state` returned.
+
+        Raises:
+            ValueError: the state has thresholds that ``"auto"`` chose, and they are
+                those of other entities or not those of this transform.
+        """
+        if "thresholds" in state:  # before anything is changed
+            self._thresholds.restore(state["thresholds"], state.get("threshold_names"))
             self.refresh_donors()  # whose index depends on them
+        super().set_extra_state(state)
 
     # --- the two halves of an augmentation -------------------------------------------
 

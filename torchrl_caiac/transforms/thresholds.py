@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -103,23 +103,39 @@ class EntityThresholds:
         """
         self._set(_checked(self.layout, numbers))
 
-    def restore(self, numbers: torch.Tensor) -> None:
+    def restore(self, numbers: torch.Tensor, names: Sequence[str] | None) -> None:
         """Sets the numbers of ``"auto"`` to those of another transform.
 
         Args:
-            numbers (torch.Tensor): float64, one for each entity that is not fixed.
+            numbers (torch.Tensor): float64, one for each name.
+            names (sequence of str, optional): the entities, in any order. ``None`` if
+                the state is of a version that did not record them.
 
         Raises:
-            ValueError: there are not as many entities.
+            ValueError: the names are unknown, or not those of the entities that are not
+                fixed; numbers were given to this transform, and they differ.
         """
-        names = _free_names(self.layout)
-        if numbers.numel() != len(names):
+        own = _free_names(self.layout)
+        if names is None or len(names) != numbers.numel():
             raise ValueError(
-                f"the state has {numbers.numel()} thresholds, the layout has "
-                f"{len(names)} entities that are not fixed, {names}: it is of another "
-                "layout"
+                "the state has thresholds that threshold='auto' chose, but not the "
+                "names of their entities: it is of an earlier version. Let 'auto' "
+                "choose again, or pass the numbers as threshold={...}"
             )
-        self.choose(dict(zip(names, numbers.tolist(), strict=True)))
+        if set(names) != set(own):
+            raise ValueError(
+                f"the state has thresholds of {list(names)}, but the entities of the "
+                f"layout that are not fixed are {own}: it is of another layout"
+            )
+        found = dict(zip(names, numbers.tolist(), strict=True))
+        if self.given == "auto":
+            self.choose(found)
+        elif found != self._numbers:
+            raise ValueError(
+                f"the state has the thresholds {found} that threshold='auto' chose, "
+                f"but this transform has threshold={self.given}: create it with "
+                "threshold='auto', or with the numbers of the state"
+            )
 
     def choose_from(self, buffer: ReplayBuffer | None, score_key: NestedKey) -> None:
         """Chooses the numbers of ``"auto"`` from the scores of a buffer.
