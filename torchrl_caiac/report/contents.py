@@ -97,14 +97,21 @@ class ReportContents:
 
     @property
     def mean_coverage(self) -> tuple[float, float] | None:
-        """The mean share of combinations before and after, over the pairs."""
-        if not self.pairs:
+        """The mean share of combinations before and after, over pairs of positions."""
+        pairs = [pair for pair in self.pairs if pair.known]
+        if not pairs:
             return None
-        count = len(self.pairs)
         return (
-            sum(pair.share_before for pair in self.pairs) / count,
-            sum(pair.share_after for pair in self.pairs) / count,
+            sum(pair.share_before for pair in pairs) / len(pairs),
+            sum(pair.share_after for pair in pairs) / len(pairs),
         )
+
+    @property
+    def unplaced(self) -> list[str]:
+        """The entities of pairs whose positions the layout does not name."""
+        cells = [cell for pair in self.pairs for cell in pair.cells]
+        unknown = {cell.name for cell in cells if not cell.known}
+        return [entity.name for entity in self.entities if entity.name in unknown]
 
 
 def collect_contents(

@@ -181,8 +181,9 @@ def pair_panel(number: int, pair: PairCoverage) -> Panel:
             pair,
             name=f"pair{number}",
             description=(
-                f"Grid of the places of {pair.names[0]} and {pair.names[1]}. Recorded "
-                f"are {before} of the combinations, with swaps {after}."
+                f"Grid of the {'places' if pair.known else 'columns'} of "
+                f"{pair.names[0]} and {pair.names[1]}. Recorded are {before} "
+                f"of the combinations, with swaps {after}."
             ),
         ),
     )
