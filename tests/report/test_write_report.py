@@ -164,6 +164,14 @@ class TestContents:
         assert "No sample was changed by a swap" in text
         assert "cup is never swapped: its score is above" in text
 
+    def test_trajectories_have_the_ids_of_the_data(self, tmp_path) -> None:
+        data = transitions(2, 40, 11)
+        data["episode"] = data["episode"] * 5 + 70
+        text = report(scored_dataset(data, LAYOUT), tmp_path)
+        found = set(re.findall(r"<h3>Trajectory (\d+)", text))
+        assert found == {"70", "75"}
+        assert "Influence scores along trajectory 75, 40 steps" in check_page(text).text
+
     def test_columns_are_not_called_positions(self, tmp_path) -> None:
         columns = {"arm": [0, 1, 2], "cup": [3, 4, 5], "box": [7, 8, 9]}
         layout = EntityLayout(columns, fixed=["arm"])

@@ -27,7 +27,7 @@ from torchrl_caiac.report.pictures import RenderFn
 from torchrl_caiac.report.places import Place, entity_places
 from torchrl_caiac.report.problems import Problem, find_problems
 from torchrl_caiac.report.settings import Entity, ReportSettings
-from torchrl_caiac.report.shares import EntityShares, entity_shares
+from torchrl_caiac.report.shares import EntityShares, entity_shares, trajectory_ids
 from torchrl_caiac.report.swaps import (
     PairCoverage,
     SampledSwaps,
@@ -163,13 +163,14 @@ def collect_contents(
     chosen = choose_examples(
         swaps, influenced, places, layout.fixed, index, settings.examples
     )
+    ids = trajectory_ids(data, index, settings.trajectory_key)
     examples, rendered, trouble = draw_examples(
-        scored, swaps, chosen, influenced, places, index, render
+        scored, swaps, chosen, influenced, places, index, ids, render
     )
     if trouble:
         _logger.warning("the examples are not rendered: %s", trouble)
     lengths = index.lengths.numpy()
-    panels, hidden = influence_panels(scored, scores, influenced, index, settings)
+    panels, hidden = influence_panels(scored, scores, influenced, index, settings, ids)
     action = data.get("action", None)
     return ReportContents(
         num_rows=len(data),
