@@ -26,6 +26,7 @@ from torchrl_caiac.data import (
     write_transitions,
 )
 from torchrl_caiac.data.digests import data_digest, file_digest, has_digests
+from torchrl_caiac.data.open_dataset import recognise_format
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.scored import DATA_FOLDER, LAYOUT_FILE, MODEL_FOLDER, SCORES_FILE
 
@@ -36,6 +37,7 @@ __all__ = [
     "add_layout",
     "convert",
     "describe_source",
+    "format_name",
     "loader_options",
     "open_data",
     "open_named",
@@ -182,9 +184,12 @@ def describe_source(
 
     Raises:
         UsageError: a path does not exist.
+        ValueError: a path has no known format.
     """
     path = _local(source)
     name = source if path is None else str(path.resolve())
+    if path is not None:
+        recognise_format(str(path), format)  # refuses a folder before it is read
     files: dict[str, Any] = {}
     root = path if path is not None else _minari_folder(source)
     if root is not None and root.is_dir() and has_digests(root):
@@ -235,6 +240,22 @@ def _minari_folder(source: str) -> Path | None:
     except ImportError:  # of Minari, which says where datasets are
         return None
     return folder if folder.is_dir() else None
+
+
+def format_name(source: str, format: str | None = None) -> str:
+    """Returns the name of the format of a source, which is there.
+
+    Args:
+        source (str): the argument DATA.
+        format (str, optional): that of ``--format``. Defaults to ``None``.
+
+    Returns:
+        str: the name.
+    """
+    path = _local(source)
+    if path is not None and (path / _META).exists():
+        return "transitions"
+    return recognise_format(source if path is None else str(path), format).name
 
 
 # --- opening -----------------------------------------------------------------------
