@@ -104,7 +104,8 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="L",
         help="which columns belong to which entity: the name of a ready layout, such "
-        "as ogbench/cube-double, or a .json or .yaml file",
+        "as ogbench/cube-double, a .json or .yaml file, or a folder that `caiac score` "
+        "wrote",
     )
 
 
@@ -112,7 +113,8 @@ def read_layout(name: str, console: Console) -> EntityLayout:
     """Returns the layout that an argument names.
 
     Args:
-        name (str): a file, or the name of a ready layout, whose notes are shown.
+        name (str): a file, a folder that ``caiac score`` wrote, or the name of a ready
+            layout, whose notes are shown.
         console (Console): where they are shown.
 
     Returns:
@@ -122,6 +124,8 @@ def read_layout(name: str, console: Console) -> EntityLayout:
         UsageError: it is neither.
         UnreadableFileError: the file is not that of a layout.
     """
+    if (Path(name) / LAYOUT_FILE).is_file():  # the folder of a scored dataset
+        return EntityLayout.load(Path(name) / LAYOUT_FILE)
     is_file = Path(name).suffix.lower() in (".json", ".yaml", ".yml")
     if is_file or Path(name).is_file():
         if not Path(name).exists():
@@ -451,6 +455,8 @@ def scored_folder(name: str) -> Path:
         UsageError: it does not exist.
     """
     folder = Path(name)
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is a file, not a folder that `caiac score` wrote")
     if not folder.is_dir():
         raise UsageError(
             f"the folder {folder} does not exist: create it with `caiac score`"
