@@ -67,7 +67,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
     console.text(f"format: {recognised}")
     console.text(str(found))
     if found.proposal is not None:
-        console.text("\nproposed layout (rename its entities, and check it):")
+        console.text(
+            "\nproposed layout (rename its entities; say where each of them is, as "
+            "positions, what is noise, as variance_floor, and its goal; check it):"
+        )
         console.text(_yaml(found.proposal))
         if file is not None:
             found.proposal.save(file)
