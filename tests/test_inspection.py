@@ -144,6 +144,7 @@ def test_nested_observations_are_grouped_by_leaf() -> None:
             "cups_right": ("observation", "cups", "right"),
         },
         fixed=["hand"],
+        positions={"hand": [0]},  # the other column is its velocity
     )
 
 
@@ -215,3 +216,50 @@ def test_an_entry_that_is_missing(key: str | tuple[str, ...]) -> None:
 def test_a_wrong_number_of_rows(rows: object) -> None:
     with pytest.raises(ValueError, match="max_rows must be"):
         inspect_dataset(push_transitions(), max_rows=rows)
+
+
+def sliding(length: int = 900, seed: int = 0) -> TensorDict:
+    """A robot and two objects, with velocities: x, y, vx, vy of each."""
+    rng = np.random.default_rng(seed)
+    action = rng.uniform(-1, 1, (length + 1, 2))
+    turn = rng.integers(0, 5, length // 20 + 1).repeat(20)[:length]
+    speeds = [action[1:]]
+    for number in range(2):
+        push = rng.normal(size=(length, 2)) * (turn == number)[:, None]
+        speeds.append(push)
+    states = []
+    for speed in speeds:
+        speed = np.concatenate([np.zeros((1, 2)), speed])
+        states += [0.05 * np.cumsum(speed, 0), speed]
+    return transitions(
+        torch.from_numpy(np.concatenate(states, -1)).float(),
+        torch.from_numpy(action[1:]).float(),
+    )
+
+
+def test_positions_are_told_from_velocities() -> None:
+    found = inspect_dataset(sliding())
+    assert found.proposal.columns == {
+        "robot": (0, 1, 2, 3),
+        "entity0": (4, 5, 6, 7),
+        "entity1": (8, 9, 10, 11),
+    }
+    expected = {"robot": (0, 1), "entity0": (4, 5), "entity1": (8, 9)}
+    assert found.proposal.positions == expected
+    assert not any("positions" in note for note in found.notes)
+
+
+def test_positions_are_told_from_velocities_in_leaves() -> None:
+    data = sliding()
+    for state in (data, data["next"]):
+        flat = state["observation"]
+        leaves = {"arm": flat[:, :4], "cup": flat[:, 4:8]}
+        state["observation"] = TensorDict(leaves, [len(flat)])
+    found = inspect_dataset(data).proposal
+    assert found.positions == {"arm": (0, 1), "cup": (0, 1)}
+
+
+def test_without_velocities_positions_are_unknown() -> None:
+    found = inspect_dataset(transitions(*world(2, [2, 2], 3)))
+    assert not found.proposal.positions
+    assert any("positions of robot, entity0" in note for note in found.notes)

@@ -15,6 +15,7 @@ LAYERS = [
     {
         "_buffer_transform",
         "_checks",
+        "_column_motion",
         "_columns",
         "_figures",
         "_files",

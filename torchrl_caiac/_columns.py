@@ -16,6 +16,7 @@ __all__ = [
     "check_names",
     "column_owner",
     "column_ranges",
+    "column_spans",
     "disjoint_columns",
     "disjoint_keys",
     "entity_names",
@@ -410,3 +411,26 @@ def column_ranges(columns: Sequence[int]) -> str:
     if len(columns) > 1 and all(b == a + 1 for a, b in pairwise(columns)):
         return f"[{columns[0]}:{columns[-1] + 1}]"
     return str(list(columns))
+
+
+def column_spans(columns: Sequence[int]) -> str:
+    """Returns columns as text for people, as spans where they are consecutive.
+
+    Args:
+        columns (sequence of int): the columns, in ascending order.
+
+    Returns:
+        str: the text.
+
+    Examples:
+        >>> from torchrl_caiac._columns import column_spans
+        >>> column_spans([0, 1, 2, 3, 7])
+        '0-3, 7'
+    """
+    parts: list[list[int]] = []
+    for column in columns:
+        if parts and column == parts[-1][-1] + 1:
+            parts[-1] = [parts[-1][0], column]
+        else:
+            parts.append([column])
+    return ", ".join("-".join(map(str, part)) for part in parts)

@@ -12,6 +12,12 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._checks import check_int
+from torchrl_caiac._column_motion import (
+    explained_shares,
+    motion_correlations,
+    position_columns,
+)
+from torchrl_caiac._columns import column_spans
 from torchrl_caiac._files import plain
 from torchrl_caiac._keys import as_key, floating, get_leaf, join, jsonable, missing_key
 from torchrl_caiac._keys import path as path_of
@@ -102,6 +108,8 @@ class MovingGroup:
         when (tuple of float): the same, in each tenth of an episode, ``[10]``.
         is_robot (bool): whether it moves almost always, or with the action.
         key (NestedKey): the leaf. Defaults to ``"observation"``.
+        positions (tuple of int): those of its columns of which another one is the
+            velocity. Defaults to ``()``: none is known.
 
     Examples:
         >>> from torchrl_caiac.inspection import MovingGroup
@@ -115,6 +123,7 @@ class MovingGroup:
     when: tuple[float, ...]
     is_robot: bool
     key: NestedKey = "observation"
+    positions: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -199,7 +208,7 @@ class Inspection:
         ]
         for group in self.groups:
             bars = "".join(_BARS[math.ceil(8 * share - 1e-9)] for share in group.when)
-            columns = _ranges(group.columns)
+            columns = column_spans(group.columns)
             if group.key != "observation":
                 columns = f"{'.'.join(path_of(group.key))} {columns}"
             robot = "  moves with the action" if group.is_robot else ""
@@ -231,7 +240,8 @@ def inspect_dataset(
     Columns belong together if they move at the same time and lie next to each other, or
     if they move at the same time almost without exception. Those that move almost
     always, or whose changes the action explains, are the robot's. In a nested
-    observation, each leaf is a group.
+    observation, each leaf is a group. A column is a position if another column of its
+    group is its velocity: has a correlation above 0.9 with its change.
 
     The proposal is where to start: look at it, name its entities, and check it with
     :func:`~torchrl_caiac.check_dataset`.
@@ -370,7 +380,8 @@ class _Columns:
         self.moves = self.moving.double().mean(0)
         large = torch.where(self.moving, size, torch.nan)
         self.step = large.nanmedian(0).values.nan_to_num(0.0)
-        self.explained = _explained(change, action)
+        self.explained = explained_shares(change, action)
+        self.positions = position_columns(now, change)
 
     @staticmethod
     def _read(data: TensorDictBase, key: NestedKey, rows: torch.Tensor) -> torch.Tensor:
@@ -396,30 +407,11 @@ class _Columns:
         return [ColumnFacts(i, *row, key=self.key) for i, row in enumerate(table)]
 
 
-def _explained(change: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    """Returns the share of each change's variance that the action explains, ``[D]``."""
-    action = torch.nan_to_num(action - action.mean(0), 0.0, 0.0, 0.0)
-    change = change - change.mean(0)
-    total = change.square().sum(0)
-    cause = torch.linalg.pinv(action) @ change
-    rest = (change - action @ cause).square().sum(0)
-    return torch.where(total > 0, 1 - rest / total.clamp(min=1e-300), 0.0).clamp(0, 1)
-
-
-def _correlations(moving: torch.Tensor) -> torch.Tensor:
-    """Returns the correlations of "moves now" between columns, ``[D, D]``."""
-    x = moving.double()
-    x = x - x.mean(0)
-    scale = x.norm(dim=0)
-    product = x.T @ x
-    return product / (scale.unsqueeze(0) * scale.unsqueeze(1)).clamp(min=1e-12)
-
-
 def _column_groups(
     part: _Columns, tenth: torch.Tensor, notes: list[str]
 ) -> list[MovingGroup]:
     """Groups the columns of a flat observation."""
-    together = _correlations(part.moving)
+    together = motion_correlations(part.moving)
     robot = part.is_robot
     still = ~part.moving.any(0)
     owner: list[int] = []  # of each column; 0: the robot, -1: nobody yet
@@ -452,8 +444,8 @@ def _column_groups(
     left_out = tuple(c for c in unmoved if owner[c] < 0)
     if left_out:
         notes.append(
-            f"columns {_ranges(left_out)} never move, or far less than the others, and "
-            "are left out: find out whose they are"
+            f"columns {column_spans(left_out)} never move, or far less than the "
+            "others, and are left out: find out whose they are"
         )
     found = sorted(set(owner) - {-1}, key=owner.index)
     names = iter(f"entity{i}" for i in range(len(found)))
@@ -518,8 +510,15 @@ def _group(
     counts = torch.bincount(tenth, minlength=_TENTHS)
     sums = torch.bincount(tenth, weights=moving, minlength=_TENTHS)
     when = (sums / counts.clamp(min=1)).tolist()
+    known = part.positions[list(columns)][:, list(columns)].any(1).tolist()
     return MovingGroup(
-        name, columns, float(moving.mean()), tuple(when), is_robot, part.key
+        name,
+        columns,
+        float(moving.mean()),
+        tuple(when),
+        is_robot,
+        part.key,
+        tuple(c for c, is_position in zip(columns, known, strict=True) if is_position),
     )
 
 
@@ -537,14 +536,24 @@ def _proposal(
         return None
     if not fixed:
         notes.append("no robot was found: name it in the layout, as fixed")
+    positions = {group.name: group.positions for group in groups if group.positions}
+    unknown = [group.name for group in groups if not group.positions]
+    if unknown:
+        notes.append(
+            f"the positions of {', '.join(unknown)} are unknown, as no column is the "
+            "velocity of another: name them in the layout, as positions"
+        )
     if is_nested:
         keys = {group.name: group.key for group in groups}
-        return EntityLayout.from_keys(keys, fixed=fixed, next_key=next_key)
+        return EntityLayout.from_keys(
+            keys, fixed=fixed, next_key=next_key, positions=positions
+        )
     return EntityLayout(
         {group.name: group.columns for group in groups},
         observation_key=observation_key,
         fixed=fixed,
         next_key=next_key,
+        positions=positions,
     )
 
 
@@ -584,14 +593,3 @@ def _leaf_line(leaf: LeafFacts) -> str:
         f"{'.'.join(path_of(leaf.key)):<30} {leaf.dtype:<9} "
         f"{list(leaf.shape)!s:<10} {low:>10} {high:>10}{bad}"
     )
-
-
-def _ranges(columns: Sequence[int]) -> str:
-    """Returns columns as ranges, such as ``"0-3, 7"``."""
-    parts: list[list[int]] = []
-    for column in columns:
-        if parts and column == parts[-1][-1] + 1:
-            parts[-1] = [parts[-1][0], column]
-        else:
-            parts.append([column])
-    return ", ".join("-".join(map(str, part)) for part in parts)

@@ -205,6 +205,17 @@ def test_states_of_integers(dtype: Any) -> None:
     assert codes(data, layout) == []
 
 
+def test_a_layout_without_a_fixed_entity() -> None:
+    layout = EntityLayout(ENTITIES)
+    findings = check_dataset(clean(), layout).findings
+    (found,) = [f for f in findings if f.code == "none_fixed"]
+    assert found.severity == "warning"
+    assert "robot, left, right" in found.message
+    assert "name the robot in fixed" in found.remedy
+    alone = EntityLayout({"left": ENTITIES["left"]})
+    assert "none_fixed" not in codes(clean(), alone)
+
+
 # --- planted errors ------------------------------------------------------------------
 
 

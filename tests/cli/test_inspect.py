@@ -20,8 +20,9 @@ def test_the_result_is_that_of_the_library(caiac: Caiac, pushes: Path) -> None:
     found = inspect_dataset(push_transitions()).to_dict()
     document = result.document
     assert result.code == 0
+    assert document.pop("format") == "transitions"
     assert document.pop("action_bounds") == [[-1.0], [1.0]]
-    assert document.pop("notes") == []
+    assert document.pop("notes")[0].startswith("the positions of entity0, entity1")
     found.pop("action_bounds"), found.pop("notes")
     assert document == found
 
@@ -29,6 +30,7 @@ def test_the_result_is_that_of_the_library(caiac: Caiac, pushes: Path) -> None:
 def test_a_person_sees_what_the_document_has(caiac: Caiac, pushes: Path) -> None:
     text = caiac("inspect", pushes).out
     for part in (
+        "format: transitions",
         "240 transitions, 6 episodes of 30 to 50",
         "next.observation",
         "action bounds: [-1.0] to [1.0]",

@@ -48,3 +48,11 @@ def test_folders_without_a_report(
 ) -> None:
     result = caiac("report", *arguments)
     assert result.code == code and message in result.error
+
+
+def test_a_file_is_no_scored_folder(caiac: Caiac, pushes: Path) -> None:
+    result = caiac("report", "layout.json")
+    assert result.code == 2
+    assert (
+        "layout.json is a file, not a folder that `caiac score` wrote" in result.error
+    )

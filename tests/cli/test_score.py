@@ -277,3 +277,35 @@ def test_a_world_model_of_another_layout(caiac: Caiac, pushes: Path) -> None:
     lent = ("--estimator", "cai", "--world-model", "scored")
     result = caiac(*SCORE[:-1], "lent", *lent)
     assert result.code == 2 and "another layout" in result.error
+
+
+def test_thresholds_are_suggested_not_warned_of(caiac: Caiac, pushes: Path) -> None:
+    # These are distances in metres: all above the default threshold of CAI, or below.
+    result = caiac(*SCORE, "--estimator", "distance", "--distance", "1e-4")
+    assert result.code == 0, result.err
+    assert "default threshold" not in result.err
+
+
+def test_the_reason_of_an_unclear_threshold_is_shown(
+    caiac: Caiac, pushes: Path
+) -> None:
+    still = push_transitions()[:20]
+    write_transitions(still, "few")
+    result = caiac("score", "few", "--layout", "layout.json", "--out", "scored")
+    scored = open_scored("scored")
+    unclear = [n for n, found in scored.confidence.items() if found == "unclear"]
+    assert unclear
+    for name in unclear:
+        assert f"{name} is unclear: {scored.reasons[name]}" in result.out
+
+
+def test_the_output_is_a_folder_by_name(caiac: Caiac, pushes: Path) -> None:
+    result = caiac(*SCORE[:-1], "scored.npz")
+    assert result.code == 2 and "scored.npz has the name of a file" in result.error
+    assert not Path("scored.npz").exists()
+
+
+def test_the_layout_of_a_scored_folder(caiac: Caiac, scored: Path) -> None:
+    result = caiac("score", "pushes", "--layout", scored, "--out", "again")
+    assert result.code == 0, result.err
+    assert open_scored("again").layout == LAYOUT

@@ -302,3 +302,30 @@ def test_data_that_are_counterfactual_already(caiac: Caiac, scored: Path) -> Non
             assert result.code == 0, result.err
             assert "240 of 480 transitions of" in result.err
     assert "are counterfactual" not in caiac("inspect", scored).err
+
+
+def test_arrays_with_other_names_are_named(caiac: Caiac, work: Path) -> None:
+    np.savez("mine.npz", obs=np.zeros((4, 2)), act=np.zeros((4, 1)), done=np.ones(4))
+    with h5py.File("mine.hdf5", "w") as file:
+        file["observations"], file["act"] = np.zeros((4, 2)), np.zeros((4, 1))
+    error = caiac("inspect", "mine.npz").error
+    assert "mine.npz lacks ['actions', 'observations'], it has ['act', 'done'" in error
+    assert "lerobot" not in error
+    error = caiac("inspect", "mine.hdf5").error
+    assert "mine.hdf5 lacks ['actions'], it has ['act', 'observations']" in error
+
+
+def test_a_folder_without_a_format_is_refused_before_it_is_read(
+    caiac: Caiac, work: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(path: Path) -> str:
+        raise AssertionError(f"{path} is read")
+
+    monkeypatch.setattr("torchrl_caiac.cli.sources.file_digest", fail)
+    Path("notes").mkdir()
+    Path("notes/text.txt").write_text("nothing")
+    result = caiac("inspect", "notes")
+    assert result.code == 1 and "notes has no known format" in result.error
+    result = caiac("score", "notes", "--layout", "fetch/push", "--out", "scored")
+    assert "notes has no known format" in result.error
+    assert not Path("scored").exists()

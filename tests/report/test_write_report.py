@@ -17,6 +17,7 @@ from torchrl_caiac import EntityLayout, check_dataset
 from torchrl_caiac.data import offline_buffer, write_transitions
 from torchrl_caiac.influence import MotionInfluence, score_buffer, suggest_thresholds
 from torchrl_caiac.report import write_report
+from torchrl_caiac.report.page import share_text
 from torchrl_caiac.scored import ScoredDataset, write_scored
 
 VOID = {"meta", "link", "img", "br"}
@@ -162,6 +163,35 @@ class TestContents:
         assert table(text, "data-pair")["cup and box"] == [before, before]
         assert "No sample was changed by a swap" in text
         assert "cup is never swapped: its score is above" in text
+
+    def test_trajectories_have_the_ids_of_the_data(self, tmp_path) -> None:
+        data = transitions(2, 40, 11)
+        data["episode"] = data["episode"] * 5 + 70
+        text = report(scored_dataset(data, LAYOUT), tmp_path)
+        found = set(re.findall(r"<h3>Trajectory (\d+)", text))
+        assert found == {"70", "75"}
+        assert set(re.findall(r"scores along trajectory (\d+)", text)) & found
+
+    def test_columns_are_not_called_positions(self, tmp_path) -> None:
+        columns = {"arm": [0, 1, 2], "cup": [3, 4, 5], "box": [7, 8, 9]}
+        layout = EntityLayout(columns, fixed=["arm"])
+        scored = scored_dataset(transitions(5, 20, 11), layout)
+        page = check_page(report(scored, tmp_path))
+        assert "names no positions of arm, cup, box. Below" in page.text
+        assert "New combinations of columns" in page.text
+        assert "of the possible combinations of places" not in page.text
+        assert "Their positions" not in page.text
+        # The number at the top is that of the pairs whose positions are known.
+        layout = EntityLayout(
+            columns, fixed=["arm"], positions={"arm": [0, 1, 2], "cup": [3, 4, 5]}
+        )
+        scored = scored_dataset(transitions(5, 20, 11), layout)
+        text = report(scored, tmp_path, overwrite=True)
+        page = check_page(text)
+        assert "names no positions of box. Below" in page.text
+        before, after = table(text, "data-pair")["arm and cup"]
+        shares = " → ".join(" ".join(share_text(x).split()) for x in (before, after))
+        assert f"{shares} of the possible combinations of places" in page.text
 
     def test_problems(self, tmp_path) -> None:
         data = transitions(5, 20, 11)

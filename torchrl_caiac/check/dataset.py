@@ -18,12 +18,18 @@ from torchrl_caiac._torchrl import last_written, storage_rows
 from torchrl_caiac.check.columns import check_columns, check_goals, unowned_columns
 from torchrl_caiac.check.ends import check_end_entries, check_ends, find_ids
 from torchrl_caiac.check.entries import check_entries, goal_entries
+from torchrl_caiac.check.kinds import finding
 from torchrl_caiac.check.motion import check_jumps, check_motion
 from torchrl_caiac.check.report import DatasetReport, Finding
 from torchrl_caiac.check.sample import Sample, take_sample
 from torchrl_caiac.check.state import States, read_states
 from torchrl_caiac.check.succession import Succession, check_succession
-from torchrl_caiac.check.values import check_action, check_finite, find_padding
+from torchrl_caiac.check.values import (
+    check_action,
+    check_finite,
+    find_padding,
+    named,
+)
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._predicted_columns import checked_predict
 from torchrl_caiac.modules._variance_floor import checked_floor
@@ -241,6 +247,9 @@ class _Check:
             complete = complete or bad <= {self.action_key}
         elif bad == {self.action_key}:
             complete = True
+        if not layout.fixed and len(layout) > 1:
+            message = f"no entity of the layout is fixed: it has {named(layout.names)}"
+            self.findings.append(finding("none_fixed", message))
         if complete:
             self._check_states(sample, index, action)
         errors_first = sorted(self.findings, key=lambda f: f.severity != "error")

@@ -182,6 +182,12 @@ KINDS: dict[str, Kind] = {
         "uninfluenced",
         "add trajectories in which it moves, or leave it out of the layout",
     ),
+    "none_fixed": Kind(
+        "warning",
+        "the robot is swapped like an object, so that counterfactuals have it in "
+        "places where it does not touch what it holds",
+        "name the robot in fixed, unless the layout leaves it out",
+    ),
     "always_moves": Kind(
         "warning",
         "if the noise of a sensor moves the entity, the world model has to tell it "

@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl_caiac.cli.console import Console
 from torchrl_caiac.cli.errors import OK, UsageError
-from torchrl_caiac.cli.sources import add_data, open_data
+from torchrl_caiac.cli.sources import add_data, format_name, open_data
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.inspection import inspect_dataset
 
@@ -62,10 +62,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     with console.step("looking at the columns"):
         found = inspect_dataset(data, layouts=matching_layouts(data))
-    document = found.to_dict()
+    recognised = format_name(args.data, args.format)
+    document = {"format": recognised, **found.to_dict()}
+    console.text(f"format: {recognised}")
     console.text(str(found))
     if found.proposal is not None:
-        console.text("\nproposed layout (rename its entities, and check it):")
+        console.text(
+            "\nproposed layout (rename its entities; say where each of them is, as "
+            "positions, what is noise, as variance_floor, and its goal; check it):"
+        )
         console.text(_yaml(found.proposal))
         if file is not None:
             found.proposal.save(file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ from torchrl_caiac.scored import ScoredDataset, write_scored
 
 __all__ = ["add_parser", "run"]
 
+# A folder with such a name would be taken for a file by other commands.
+_FILES = (".npz", ".npy", ".hdf5", ".h5", ".json", ".yaml", ".yml", ".html")
 _EPILOG = """\
 example:
   caiac score episodes.npz --layout ogbench/cube-double --out scored
@@ -107,6 +110,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     folder = Path(args.out)
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is a file: give a folder")
+    if folder.suffix.lower() in _FILES:
+        raise UsageError(f"--out {folder} has the name of a file: give a folder")
     with own_folder(folder):
         data = convert(args.data, folder, described, console, overwrite=args.overwrite)
         replace = _settle(args, layout, settings, folder)
@@ -221,14 +226,17 @@ def _write_scores(rb: Any, estimator: Any, context: Context, *, replace: bool) -
         "check": False,
         "progress": context.console.progress,
     }
-    try:
-        score_buffer(rb, estimator, **arguments)
-    except ValueError:
-        # Of other settings, which --overwrite has replaced; an interrupted call
-        # that has begun to replace them does not come here, and resumes.
-        if not replace:
-            raise
-        score_buffer(rb, estimator, overwrite=True, **arguments)
+    with warnings.catch_warnings():
+        # Thresholds are suggested next, and shown with what they make swappable.
+        warnings.filterwarnings("ignore", message="with the default threshold")
+        try:
+            score_buffer(rb, estimator, **arguments)
+        except ValueError:
+            # Of other settings, which --overwrite has replaced; an interrupted call
+            # that has begun to replace them does not come here, and resumes.
+            if not replace:
+                raise
+            score_buffer(rb, estimator, overwrite=True, **arguments)
 
 
 def _coverage(context: Context) -> dict[str, Any] | None:
@@ -257,6 +265,9 @@ def _show(scored: ScoredDataset, console: Console) -> None:
             f"{name:<{width}}{threshold:>10.4g}{scored.free[name]:>11.1%}   "
             f"{scored.confidence[name]}"
         )
+    for name, found in scored.confidence.items():
+        if found == "unclear":
+            console.text(f"{name} is unclear: {scored.reasons[name]}")
     console.text(f"\nwritten to {scored.path}; next: caiac report {scored.path}")
     console.document(
         {

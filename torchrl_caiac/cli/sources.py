@@ -33,6 +33,7 @@ from torchrl_caiac.data import (
     write_transitions,
 )
 from torchrl_caiac.data.digests import data_digest, file_digest, has_digests
+from torchrl_caiac.data.open_dataset import recognise_format
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.scored import DATA_FOLDER, LAYOUT_FILE, MODEL_FOLDER, SCORES_FILE
 
@@ -43,6 +44,7 @@ __all__ = [
     "add_layout",
     "convert",
     "describe_source",
+    "format_name",
     "loader_options",
     "open_data",
     "open_named",
@@ -109,7 +111,8 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
         required=True,
         metavar="L",
         help="which columns belong to which entity: the name of a ready layout, such "
-        "as ogbench/cube-double, or a .json or .yaml file",
+        "as ogbench/cube-double, a .json or .yaml file, or a folder that `caiac score` "
+        "wrote",
     )
 
 
@@ -117,7 +120,8 @@ def read_layout(name: str, console: Console) -> EntityLayout:
     """Returns the layout that an argument names.
 
     Args:
-        name (str): a file, or the name of a ready layout, whose notes are shown.
+        name (str): a file, a folder that ``caiac score`` wrote, or the name of a ready
+            layout, whose notes are shown.
         console (Console): where they are shown.
 
     Returns:
@@ -127,6 +131,8 @@ def read_layout(name: str, console: Console) -> EntityLayout:
         UsageError: it is neither.
         UnreadableFileError: the file is not that of a layout.
     """
+    if (Path(name) / LAYOUT_FILE).is_file():  # the folder of a scored dataset
+        return EntityLayout.load(Path(name) / LAYOUT_FILE)
     is_file = Path(name).suffix.lower() in (".json", ".yaml", ".yml")
     if is_file or Path(name).is_file():
         if not Path(name).exists():
@@ -190,9 +196,12 @@ def describe_source(
     Raises:
         UsageError: a path does not exist.
         UnreadableFileError: transitions have changed since they were written.
+        ValueError: a path has no known format.
     """
     path = _local(source)
     name = source if path is None else str(path.resolve())
+    if path is not None:
+        recognise_format(str(path), format)  # refuses a folder before it is read
     files: dict[str, Any] = {}
     root = path if path is not None else _minari_folder(source)
     if root is not None and root.is_dir() and has_digests(root):
@@ -250,6 +259,22 @@ def _minari_folder(source: str) -> Path | None:
     except ImportError:  # of Minari, which says where datasets are
         return None
     return folder if folder.is_dir() else None
+
+
+def format_name(source: str, format: str | None = None) -> str:
+    """Returns the name of the format of a source, which is there.
+
+    Args:
+        source (str): the argument DATA.
+        format (str, optional): that of ``--format``. Defaults to ``None``.
+
+    Returns:
+        str: the name.
+    """
+    path = _local(source)
+    if path is not None and (path / _META).exists():
+        return "transitions"
+    return recognise_format(source if path is None else str(path), format).name
 
 
 # --- opening -----------------------------------------------------------------------
@@ -464,6 +489,8 @@ def scored_folder(name: str) -> Path:
         UsageError: it does not exist.
     """
     folder = Path(name)
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is a file, not a folder that `caiac score` wrote")
     if not folder.is_dir():
         raise UsageError(
             f"the folder {folder} does not exist: create it with `caiac score`"

@@ -21,12 +21,13 @@ from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.minari_files import dataset_path, open_minari
 from torchrl_caiac.data.npz_streams import NpzStreams
 
-__all__ = ["FORMATS", "DatasetFormat", "open_dataset"]
+__all__ = ["FORMATS", "DatasetFormat", "open_dataset", "recognise_format"]
 
 _logger = logging.getLogger("torchrl_caiac.data.open_dataset")
 
 _AGAIN = "download or create the dataset again"
 _HDF5 = (".hdf5", ".h5")
+_ARRAYS = {"observations", "actions"}
 # What OGBench's files and functions have.
 _OGBENCH = {"observations", "actions", "terminals"}
 _OGBENCH_MORE = {"next_observations", "valids", "rewards", "masks", "oracle_reps"}
@@ -130,18 +131,8 @@ def open_dataset(
         >>> folder.cleanup()
     """
     source = os.fspath(source)
-    scheme, sign, name = source.partition("://")
-    if format is not None:
-        known = _by_name(format, source)
-        if sign and known.scheme != scheme:
-            raise ValueError(
-                f"{source} does not have the format {format!r}: leave out format=, or "
-                f"give {'a path' if known.scheme is None else f'{known.scheme}://NAME'}"
-            )
-    elif sign:
-        known = _by_scheme(scheme, source)
-    else:
-        known = _recognise(source)
+    _, sign, name = source.partition("://")
+    known = recognise_format(source, format)
     if known.name != "transitions":
         options = {"overwrite": overwrite, "progress": progress, **options}
     if sign:
@@ -149,6 +140,40 @@ def open_dataset(
     _check_options(known, options)
     _logger.info("%s is read as %s", source, known.name)
     return known.load(name if sign else source, path, **options)
+
+
+def recognise_format(source: str, format: str | None = None) -> DatasetFormat:
+    """Returns the format of a dataset, without reading it.
+
+    Args:
+        source (str): the dataset, as for :func:`open_dataset`.
+        format (str, optional): the name of the format. Defaults to ``None``: it is
+            recognised.
+
+    Returns:
+        DatasetFormat: the format.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UnreadableFileError: the file is damaged.
+        ValueError: the format is unknown, or a file lacks arrays; the message lists
+            those that it has.
+
+    Examples:
+        >>> from torchrl_caiac.data.open_dataset import recognise_format
+        >>> recognise_format("tests/data/lerobot/v2.1").name
+        'lerobot'
+    """
+    scheme, sign, _ = source.partition("://")
+    if format is not None:
+        known = _by_name(format, source)
+        if sign and known.scheme != scheme:
+            raise ValueError(
+                f"{source} does not have the format {format!r}: leave out format=, or "
+                f"give {'a path' if known.scheme is None else f'{known.scheme}://NAME'}"
+            )
+        return known
+    return _by_scheme(scheme, source) if sign else _recognise(source)
 
 
 def _by_name(name: str, source: str) -> DatasetFormat:
@@ -171,6 +196,8 @@ def _recognise(source: str) -> DatasetFormat:
         for known in FORMATS:
             if known.matches(path):
                 return known
+        if path.suffix in (".npz", *_HDF5):
+            raise _lacking(source, _names_in_npz(path) | _names_in_hdf5(path))
         raise _unknown(f"{source} has no known format{_contents(path)}")
     if path.suffix in (".npz", *_HDF5):
         raise FileNotFoundError(f"there is no file {source}: give another one")
@@ -184,6 +211,20 @@ def _contents(path: Path) -> str:
         return ""
     names = sorted(item.name for item in path.iterdir())
     return f" (the folder has {names[:10]}{' and more' if len(names) > 10 else ''})"
+
+
+def _lacking(source: str, names: set[str]) -> ValueError:
+    found = sorted(names)
+    other = (
+        " (a file of robomimic has data/demo_*)" if Path(source).suffix in _HDF5 else ""
+    )
+    return ValueError(
+        f"{source} lacks {sorted(_ARRAYS - names)}, it has {found[:20]}"
+        f"{' and more' if len(found) > 20 else ''}{other}: rename its arrays to "
+        "observations, actions and, for the ends of episodes, timeouts or terminals "
+        "(dones beside them), episode_lengths or episode_ids; or convert them with "
+        "from_arrays"
+    )
 
 
 def _unknown(what: str) -> ValueError:
@@ -251,7 +292,7 @@ def _names_in_hdf5(path: Path) -> set[str]:
 
 
 def _is_arrays(names: set[str]) -> bool:
-    return {"observations", "actions"} <= names
+    return names >= _ARRAYS
 
 
 # --- loaders with another form -------------------------------------------------------

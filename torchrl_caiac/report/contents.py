@@ -27,7 +27,7 @@ from torchrl_caiac.report.pictures import RenderFn
 from torchrl_caiac.report.places import Place, entity_places
 from torchrl_caiac.report.problems import Problem, find_problems
 from torchrl_caiac.report.settings import Entity, ReportSettings
-from torchrl_caiac.report.shares import EntityShares, entity_shares
+from torchrl_caiac.report.shares import EntityShares, entity_shares, trajectory_ids
 from torchrl_caiac.report.swaps import (
     PairCoverage,
     SampledSwaps,
@@ -97,14 +97,21 @@ class ReportContents:
 
     @property
     def mean_coverage(self) -> tuple[float, float] | None:
-        """The mean share of combinations before and after, over the pairs."""
-        if not self.pairs:
+        """The mean share of combinations before and after, over pairs of positions."""
+        pairs = [pair for pair in self.pairs if pair.known]
+        if not pairs:
             return None
-        count = len(self.pairs)
         return (
-            sum(pair.share_before for pair in self.pairs) / count,
-            sum(pair.share_after for pair in self.pairs) / count,
+            sum(pair.share_before for pair in pairs) / len(pairs),
+            sum(pair.share_after for pair in pairs) / len(pairs),
         )
+
+    @property
+    def unplaced(self) -> list[str]:
+        """The entities of pairs whose positions the layout does not name."""
+        cells = [cell for pair in self.pairs for cell in pair.cells]
+        unknown = {cell.name for cell in cells if not cell.known}
+        return [entity.name for entity in self.entities if entity.name in unknown]
 
 
 def collect_contents(
@@ -156,13 +163,14 @@ def collect_contents(
     chosen = choose_examples(
         swaps, influenced, places, layout.fixed, index, settings.examples
     )
+    ids = trajectory_ids(data, index, settings.trajectory_key)
     examples, rendered, trouble = draw_examples(
-        scored, swaps, chosen, influenced, places, index, render
+        scored, swaps, chosen, influenced, places, index, ids, render
     )
     if trouble:
         _logger.warning("the examples are not rendered: %s", trouble)
     lengths = index.lengths.numpy()
-    panels, hidden = influence_panels(scored, scores, influenced, index, settings)
+    panels, hidden = influence_panels(scored, scores, influenced, index, settings, ids)
     action = data.get("action", None)
     return ReportContents(
         num_rows=len(data),

@@ -30,7 +30,7 @@ class Example:
 
     Attributes:
         row (int): the stored transition.
-        trajectory (int): the number of its trajectory, from 1.
+        trajectory (int): the id of its trajectory.
         step (int): its step in the trajectory, from 0.
         moved (tuple of str): the entities that a swap has put elsewhere.
         unmoved (tuple of str): the entities that were swapped, but whose place is about
@@ -60,6 +60,7 @@ def draw_examples(
     influenced: torch.Tensor,
     places: Mapping[str, Place],
     index: TrajectoryIndex,
+    ids: Sequence[int],
     render: RenderFn | Literal["auto"] | None,
 ) -> tuple[list[Example], bool, str]:
     """Draws counterfactual samples.
@@ -71,6 +72,7 @@ def draw_examples(
         influenced (torch.Tensor): bool ``[T, N]``.
         places (mapping of str to Place): where each entity is, in layout order.
         index (TrajectoryIndex): the trajectories.
+        ids (sequence of int): the id of each of them.
         render (callable, "auto" or None): as in
             :func:`~torchrl_caiac.report.write_report`.
 
@@ -108,7 +110,7 @@ def draw_examples(
         examples.append(
             Example(
                 row=row,
-                trajectory=trajectory + 1,
+                trajectory=ids[trajectory],
                 step=int(index.position(torch.tensor(row)) - first),
                 moved=moved_names,
                 unmoved=tuple(names[(swapped & ~elsewhere).numpy()]),

@@ -72,6 +72,7 @@ def influence_panels(
     influenced: torch.Tensor,
     index: TrajectoryIndex,
     settings: ReportSettings,
+    ids: Sequence[int],
 ) -> tuple[list[Panel], list[str]]:
     """Returns the scores along some trajectories.
 
@@ -81,6 +82,7 @@ def influence_panels(
         influenced (torch.Tensor): bool ``[T, N]``.
         index (TrajectoryIndex): the trajectories.
         settings (ReportSettings): how many to show.
+        ids (sequence of int): the id of each trajectory.
 
     Returns:
         tuple: the panels, and the entities that they leave out: those that are
@@ -111,7 +113,7 @@ def influence_panels(
         said = ", ".join(parts) if parts else "no entity"
         panels.append(
             Panel(
-                f"Trajectory {number + 1}",
+                f"Trajectory {ids[number]}",
                 draw_influence(
                     scores[rows][:, shown].numpy(),
                     flags.numpy(),
@@ -119,7 +121,7 @@ def influence_panels(
                     [scored.thresholds[name] for name in names],
                     name=f"influence{number}",
                     description=(
-                        f"Influence scores along trajectory {number + 1}, {length} "
+                        f"Influence scores along trajectory {ids[number]}, {length} "
                         f"steps. The agent influences {said}."
                     ),
                 ),
@@ -181,8 +183,9 @@ def pair_panel(number: int, pair: PairCoverage) -> Panel:
             pair,
             name=f"pair{number}",
             description=(
-                f"Grid of the places of {pair.names[0]} and {pair.names[1]}. Recorded "
-                f"are {before} of the combinations, with swaps {after}."
+                f"Grid of the {'places' if pair.known else 'columns'} of "
+                f"{pair.names[0]} and {pair.names[1]}. Recorded are {before} "
+                f"of the combinations, with swaps {after}."
             ),
         ),
     )

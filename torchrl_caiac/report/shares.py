@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 
+from torchrl_caiac.check.ends import find_ids
 from torchrl_caiac.trajectories import TrajectoryIndex
 
-__all__ = ["EntityShares", "choose_trajectories", "entity_shares"]
+__all__ = ["EntityShares", "choose_trajectories", "entity_shares", "trajectory_ids"]
 
 
 @dataclass(frozen=True)
@@ -114,3 +117,33 @@ def choose_trajectories(
         if number not in drawn:
             drawn.append(number)
     return sorted(drawn)
+
+
+def trajectory_ids(
+    data: TensorDictBase, index: TrajectoryIndex, trajectory_key: NestedKey | None
+) -> list[int]:
+    """Returns how people find trajectories in the data: by their stored ids.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+        index (TrajectoryIndex): the trajectories.
+        trajectory_key (NestedKey, optional): the trajectory ids.
+
+    Returns:
+        list of int: the id of each trajectory, in the order of the index; without ids,
+        its number, from 0.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.report.shares import trajectory_ids
+        >>> from torchrl_caiac.trajectories import trajectory_index
+        >>> data = TensorDict({"episode": torch.tensor([7, 7, 3])}, [3])
+        >>> trajectory_ids(data, trajectory_index(data), "episode")
+        [7, 3]
+    """
+    key = find_ids(data, trajectory_key)
+    if key is None:
+        return list(range(len(index.ends)))
+    ids = data.get(key)[index.starts].reshape(len(index.ends), -1)[:, 0]
+    return [int(number) for number in ids]

@@ -154,6 +154,8 @@ class Cells:
             ``None`` for cells of a plane.
         recorded (torch.Tensor): int64 ``[M]``, the cell of each recorded sample.
         made (torch.Tensor): int64 ``[M]``, the cell of each sample after swapping.
+        known (bool): whether the layout says that the features are positions. Defaults
+            to ``True``.
     """
 
     name: str
@@ -161,6 +163,7 @@ class Cells:
     edges: torch.Tensor | None
     recorded: torch.Tensor
     made: torch.Tensor
+    known: bool = True
 
     @property
     def count(self) -> int:
@@ -186,6 +189,11 @@ class PairCoverage:
     def names(self) -> tuple[str, str]:
         """The entities."""
         return self.cells[0].name, self.cells[1].name
+
+    @property
+    def known(self) -> bool:
+        """Whether the layout says where both entities are."""
+        return self.cells[0].known and self.cells[1].known
 
     @property
     def possible(self) -> int:
@@ -274,7 +282,8 @@ def _cells(swaps: SampledSwaps, name: str, place: Place) -> Cells | None:
         widest = int((high - low).argmax())
         edges = torch.linspace(low[widest], high[widest], CELLS + 1).double()
         before, after = (divided(values, widest, CELLS) for values in (recorded, made))
-        return Cells(name, (place.labels[widest],), edges, before, after)
+        label = (place.labels[widest],)
+        return Cells(name, label, edges, before, after, place.known)
 
     def planar(values: torch.Tensor) -> torch.Tensor:
         row, column = (divided(values, feature, PLANE) for feature in (0, 1))
