@@ -322,7 +322,7 @@ def test_the_result_of_a_faster_call_stays(
         made.mkdir()
         (made / "other").touch()
 
-    monkeypatch.setattr("torchrl_caiac.augment.dataset.write_digests", slow)
+    monkeypatch.setitem(augment_dataset.__globals__, "write_digests", slow)
     with pytest.raises(FileExistsError):
         augment_dataset(plain, made, progress=False)
     assert [p.name for p in made.iterdir()] == ["other"]

@@ -93,8 +93,9 @@ def augment_dataset(
             written.
         ValueError: an argument is out of range; ``path`` is the scored dataset or what
             it was made from, or one of them is inside of the other; nothing can be
-            swapped; the choice of rewards is missing; no sparse reward agrees with the stored ones, or the
-            task ends in other rows than those that reach their goals.
+            swapped; the choice of rewards is missing; no sparse reward agrees with the
+            stored ones, or the task ends in other rows than those that reach their
+            goals.
 
     Examples:
         See :doc:`/cli`.
