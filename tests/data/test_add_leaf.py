@@ -63,6 +63,7 @@ class TestAddLeaf:
             ("weight", torch.zeros(5), r"shape \[5\], expected \[6\]"),
             ("weight", ["a"] * 6, "are no numbers"),
             ("shape", torch.zeros(6), "reserve: rename it"),
+            ("info.clock", torch.zeros(6), "have the same name with dots"),
         ],
     )
     def test_what_is_refused(self, key, values, match, data, tmp_path):

@@ -135,6 +135,26 @@ def test_a_bad_episode_is_refused_and_can_be_skipped(rows, ends, match, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
+def test_keys_with_the_same_name_with_dots_are_refused(tmp_path):
+    observations = {"a.b": np.zeros((4, 2)), "a": {"b": np.ones((4, 2))}}
+    rows = episode_transitions(observations, np.zeros((3, 1)), where="it")
+    match = r"'a\.b'\).*'a', 'b'\).* of it have the same name with dots"
+    with (
+        pytest.raises(ValueError, match=match),
+        TransitionWriter(tmp_path / "a") as writer,
+    ):
+        writer.add(rows, where="it")
+    assert not list(tmp_path.iterdir())
+    for name in ("a.b", "a.c"):  # each alone is stored
+        one = rows.exclude(("observation", "a"), ("next", "observation", "a"))
+        for root in (one, one["next"]):
+            root.rename_key_(("observation", "a.b"), ("observation", name))
+        with TransitionWriter(tmp_path / name) as writer:
+            writer.add(one)
+        data = load_transitions(tmp_path / name, verify=True)
+        assert data["observation", name].shape == (3, 2)
+
+
 def test_texts_and_reserved_names_are_refused(tmp_path):
     for key, value in (("text", "cup"), ("shape", torch.zeros(3))):
         with (

@@ -21,7 +21,7 @@ from torchrl_caiac._torchrl import (
     mark_memmap,
     memmap_folder,
 )
-from torchrl_caiac.data.write_transitions import check_entries
+from torchrl_caiac.data.write_transitions import check_entries, check_key_names
 
 __all__ = ["add_leaf", "new_leaf", "remove_leaf", "store_leaves"]
 
@@ -94,6 +94,7 @@ def add_leaf(data: TensorDictBase, key: NestedKey, values: Any) -> torch.Tensor:
                 )
             )
     check_entries(data.empty().set(key, leaf), "the data")
+    check_key_names([*data.keys(True, True), key], "the data")
     if not data.is_memmap():
         with data.unlock_() if data.is_locked else contextlib.nullcontext():
             data.set(key, leaf)

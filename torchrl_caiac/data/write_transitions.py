@@ -22,6 +22,7 @@ __all__ = [
     "check_bounds_fit",
     "check_entries",
     "check_free",
+    "check_key_names",
     "whole_transitions",
     "write_transitions",
 ]
@@ -65,7 +66,7 @@ def check_entries(data: TensorDictBase, what: str = "the data") -> None:
 
     Raises:
         ValueError: an entry is not a tensor, or has a name that tensordict's files
-            reserve.
+            reserve; or see :func:`check_key_names`.
 
     Examples:
         >>> import torch
@@ -83,6 +84,31 @@ def check_entries(data: TensorDictBase, what: str = "the data") -> None:
             raise ValueError(
                 f"{key!r} of {what} has one of the names {sorted(_RESERVED)}, which "
                 "tensordict's files reserve: rename it"
+            )
+    check_key_names(data.keys(True, True), what)
+
+
+def check_key_names(keys: Iterable[NestedKey], what: str) -> None:
+    """Raises if two keys have the same name where their parts are joined by dots.
+
+    Args:
+        keys (iterable of NestedKey): the keys of the transitions.
+        what (str): the name of the transitions in the error message.
+
+    Raises:
+        ValueError: two keys do. The digests are stored by these names.
+
+    Examples:
+        >>> from torchrl_caiac.data.write_transitions import check_key_names
+        >>> check_key_names(["a.b", ("a", "c")], "the data")
+    """
+    found: dict[str, NestedKey] = {}
+    for key in keys:
+        other = found.setdefault(".".join(path_of(key)), key)
+        if path_of(other) != path_of(key):
+            raise ValueError(
+                f"{other!r} and {key!r} of {what} have the same name with dots, by "
+                "which digests are stored: rename one of them"
             )
 
 
