@@ -5,6 +5,7 @@ import json
 import traceback
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -359,3 +360,15 @@ def test_read_returns_numbers_whose_differences_do_not_wrap_around(dtype):
         change = layout.read(td, next=True) - layout.read(td)
         want = after.double() - before.double()
         assert sorted(change.flatten().tolist()) == sorted(want.flatten().tolist())
+
+
+@pytest.mark.parametrize(
+    "floor",
+    [np.float64(0.5), np.float32(0.5), np.array(0.5), torch.tensor(0.5)],
+)
+def test_floors_may_be_numbers_of_numpy(floor):
+    layout = EntityLayout({"a": [0, 1], "b": [2]}, variance_floor=floor)
+    assert layout.variance_floor == {"a": 0.5, "b": 0.5}
+    each = {"a": np.array([0.5, 1], np.float32), "b": floor}
+    layout = EntityLayout({"a": [0, 1], "b": [2]}, variance_floor=each)
+    assert layout.variance_floor == {"a": (0.5, 1.0), "b": 0.5}

@@ -113,6 +113,8 @@ def entity_floors(
     result: dict[str, float | tuple[float, ...]] = {}
     for name in names:
         value = given[name]
+        # NumPy's numbers and arrays, and tensors, become Python's.
+        value = value.tolist() if hasattr(value, "tolist") else value
         one = not isinstance(value, Sequence) or isinstance(value, str)
         values = [value] if one else list(value)
         if any(

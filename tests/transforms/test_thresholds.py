@@ -7,6 +7,7 @@ import math
 import pickle
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -302,3 +303,10 @@ def test_auto_in_an_ensemble_is_refused(where: str) -> None:
         owner.append_transform(CAIACTransform(LAYOUT, "auto"))
     with pytest.raises(RuntimeError, match="StorageEnsemble: pass numbers"):
         ensemble.sample()
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
+def test_numbers_of_numpy(kind) -> None:
+    layout = EntityLayout({"a": [0], "b": [1]})
+    for given in (kind(0), {"a": kind(0), "b": kind(0)}):
+        CAIACTransform(layout, threshold=given)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -45,7 +46,7 @@ def check_number(name: str, value: Any, high: float) -> float:
         ...
         ValueError: swap_prob must be in [0, 1], got 2
     """
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
     if not 0 <= value <= high or not math.isfinite(value):
         limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"

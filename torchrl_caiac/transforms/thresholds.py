@@ -6,7 +6,12 @@ import logging
 import math
 import threading
 import warnings
+<<<<<<< HEAD
 from collections.abc import Mapping, Sequence
+=======
+from collections.abc import Mapping
+from numbers import Real
+>>>>>>> fixc
 from typing import Any, Literal
 
 import torch
@@ -246,7 +251,7 @@ def _checked(layout: EntityLayout, numbers: Mapping[str, Any]) -> dict[str, floa
     result = {}
     for name in names:
         value = numbers[name]
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if isinstance(value, bool) or not isinstance(value, Real):
             raise TypeError(f"threshold of {name!r} must be a number, got {value!r}")
         if not math.isfinite(value):
             raise ValueError(f"threshold of {name!r} must be finite, got {value!r}")
