@@ -25,7 +25,7 @@ _LARGE = 0.999  # the quantile of the changes that stands for fast motion
 # among the rows that seem to rest, in which much slower motion may hide.
 _STILL = (1e-2, 1e-3)
 # Of the median change of the fastest entity, at least.
-_FLOOR_BESIDE, _TOLERANCE_BESIDE = 0.01, 0.002
+_FLOOR_BESIDE, _TOLERANCE_BESIDE = 0.05, 0.002
 _BINS = 120
 _SPREAD = 0.1  # decades: the smallest deviation of a mode
 # Nats for each row of the smaller mode, by which two modes must explain the data better
@@ -79,7 +79,7 @@ def resting_noise(
     the median change while the entity moves, and the resolution of the numbers. The
     tolerance is the largest of four times the noise, the 99.9 % quantile of the changes
     at rest, a fiftieth of the median change while the entity moves, and the resolution.
-    For positions that the layout names, the floor is also at least a hundredth, and the
+    For positions that the layout names, the floor is also at least a twentieth, and the
     tolerance a 500th, of the median change of the fastest entity: next to it, a
     simulator's jitter is no motion.
 
@@ -170,7 +170,7 @@ def _beside_the_fastest(
         reason = noise.reason
         if max(floor[c] for c in own) > max(noise.floor[c] for c in own):
             reason += (
-                f"; raised to {_FLOOR_BESIDE * most:.3g}, a hundredth of the median "
+                f"; raised to {_FLOOR_BESIDE * most:.3g}, a twentieth of the median "
                 f"change of {fastest!r}"
             )
         found[name] = replace(noise, floor=floor, tolerance=tolerance, reason=reason)

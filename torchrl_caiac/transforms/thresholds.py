@@ -6,12 +6,8 @@ import logging
 import math
 import threading
 import warnings
-<<<<<<< HEAD
 from collections.abc import Mapping, Sequence
-=======
-from collections.abc import Mapping
 from numbers import Real
->>>>>>> fixc
 from typing import Any, Literal
 
 import torch
