@@ -210,6 +210,26 @@ def test_zeros_are_a_mode_of_their_own() -> None:
     assert split_scores(binary).confidence == CLEAR
 
 
+@pytest.mark.parametrize(
+    ("found", "near", "confidence"),
+    [
+        (100, 300, CLEAR),  # also scores 1 where it could be moved
+        (100, 0, CLEAR),
+        (94, 300, UNCLEAR),  # misses motion
+        (100, 850, UNCLEAR),  # tells little
+    ],
+)
+def test_scores_of_0_and_1_have_their_own_threshold(found, near, confidence) -> None:
+    row = np.arange(1000)
+    motion = np.where(row < 100, MOVES, RESTS).astype(np.int8)
+    scores = ((row < found) | ((row >= 100) & (row < 100 + near))).astype(np.float64)
+    split = split_scores(scores, motion)
+    assert split.threshold == 0.5 and split.confidence == confidence
+    never = split_scores(scores, np.full(1000, RESTS, np.int8))
+    assert never.threshold == 0.5 and never.confidence == CLEAR
+    assert "own threshold is 0.5; it never moves" in never.reason
+
+
 @pytest.mark.parametrize(("moving", "confidence"), [(4, UNCLEAR), (5, CLEAR)])
 def test_zeros_need_fewer_moving_rows(moving: int, confidence: str) -> None:
     scores = np.where(np.arange(400) < moving, 7.0, 0.0)

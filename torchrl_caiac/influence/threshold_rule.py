@@ -29,6 +29,10 @@ _FEWEST_WITH_ZEROS = 5  # the same where zeros are a mode, which needs no estima
 # the balanced accuracy of the best threshold.
 _AREA = 0.95
 _ACCURACY = 0.9
+# Scores of 0 and 1 have their own threshold. Rows at rest may score 1, if the agent
+# is near, so that they only have to find the motion, and to tell something.
+_RECALL = 0.95
+_LEAST_AREA = 0.6
 # The split of the scores alone is kept where its balanced accuracy is this near the
 # best one: rows at rest whose entity could have been moved count as errors here, so
 # that the best threshold for motion is too high.
@@ -123,6 +127,9 @@ def split_scores(
         reason = f"it never moves in {len(scores)} rows"
         # The agent may have been able to move it in the rows of an upper mode.
         alone = None if equal else _by_scores(scores, threshold, reason)
+        if alone is not None and _is_binary(scores):
+            reason = f"the scores are 0 or 1, whose own threshold is 0.5; {reason}"
+            return Split(threshold, "two clear modes", reason, area)
         if alone is not None and alone.confidence == "two clear modes":
             reason = (
                 f"{alone.reason}: whether the agent could move it in the upper mode is "
@@ -170,6 +177,13 @@ def _has_zero_mode(scores: NDArray[np.float64]) -> bool:
     return bool(positive.min() >= _SPREAD * np.median(positive))
 
 
+def _is_binary(scores: NDArray[np.float64]) -> bool:
+    """Returns whether the scores are 0 and 1, as those of a rule."""
+    return bool(
+        scores.min() == 0 and scores.max() == 1 and np.isin(scores, (0, 1)).all()
+    )
+
+
 def _otsu(values: NDArray[np.float64]) -> float:
     """Returns Otsu's split, in the middle of the gap; the values differ."""
     values = np.sort(values)
@@ -212,6 +226,13 @@ def _by_motion(
         f"rows in which it moves ({len(moves)}) score above those in which it rests "
         f"({len(rests)}) with probability {area:.3f}"
     )
+    found = float((moves > 0).mean())
+    if _is_binary(scores) and found >= _RECALL and area >= _LEAST_AREA:
+        reason = (
+            f"the scores are 0 or 1, whose own threshold is 0.5; {text}, and "
+            f"{100 * found:.1f} % of the rows in which it moves score 1"
+        )
+        return Split(start, "two clear modes", reason, area)
     if area < _AREA or best < _ACCURACY:
         reason = (
             f"{text}, at least {_AREA} needed: the estimator misses influence, or the "
