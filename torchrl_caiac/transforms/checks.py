@@ -48,10 +48,11 @@ def check_number(name: str, value: Any, high: float) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
-    if not 0 <= value <= high or not math.isfinite(value):
+    number = float(value)
+    if not 0 <= number <= high or not math.isfinite(number):
         limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"
         raise ValueError(f"{name} must be {limits}, got {value!r}")
-    return float(value)
+    return number
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> Any:
