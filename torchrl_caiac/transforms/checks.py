@@ -48,7 +48,7 @@ def check_number(name: str, value: Any, high: float) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
-    if not 0 <= value <= high or not math.isfinite(value):
+    if not 0 <= float(value) <= high or not math.isfinite(value):
         limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"
         raise ValueError(f"{name} must be {limits}, got {value!r}")
     return float(value)
