@@ -97,7 +97,7 @@ def test_names_are_downloaded(sources, tmp_path, monkeypatch):
     assert (data == load_lerobot(LEROBOT, tmp_path / "b", progress=False)).all()
     # One that is here already is not.
     data = open_dataset(
-        "ogbench://point-v0", tmp_path / "c", root=tmp_path, progress=False
+        "ogbench://pointmaze-v0", tmp_path / "c", root=tmp_path, progress=False
     )
     assert len(data) == 4
     with pytest.raises(FileNotFoundError, match=r"'cup-v0' is not at"):

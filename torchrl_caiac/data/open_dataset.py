@@ -33,7 +33,12 @@ _OGBENCH_MORE = {"next_observations", "valids", "rewards", "masks", "oracle_reps
 _OGBENCH_OWN = {"valids", "masks", "oracle_reps", "qpos", "qvel", "button_states"}
 _OGBENCH_MORE |= _OGBENCH_OWN
 # How the names of its datasets begin, some of whose files have nothing else.
-_OGBENCH_NAMES = ("antmaze-", "antsoccer-", "humanoidmaze-", "pointmaze-")
+_OGBENCH_NAMES: tuple[str, ...] = (
+    "antmaze-",
+    "antsoccer-",
+    "humanoidmaze-",
+    "pointmaze-",
+)
 _OGBENCH_NAMES += ("cube-", "scene-", "puzzle-", "powderworld-", "visual-")
 
 
