@@ -45,7 +45,7 @@ def sources(tmp_path, monkeypatch):
     to_minari(transitions(), "push/play-v0", progress=False)
     shutil.copytree(LEROBOT, tmp_path / "lerobot")
     arrays = {"observations": STATES, "actions": ACTIONS}
-    np.savez_compressed(tmp_path / "point-v0.npz", **arrays, terminals=ENDS)
+    np.savez_compressed(tmp_path / "pointmaze-v0.npz", **arrays, terminals=ENDS)
     np.savez(tmp_path / "plain.npz", **arrays, timeouts=ENDS)
     with h5py.File(tmp_path / "lift.hdf5", "w") as file:
         file["data/demo_0/obs/object"], file["data/demo_0/actions"] = STATES, ACTIONS
@@ -56,7 +56,7 @@ def sources(tmp_path, monkeypatch):
         "transitions": tmp_path / "rows",
         "minari": "push/play-v0",
         "lerobot": tmp_path / "lerobot",
-        "ogbench": tmp_path / "point-v0.npz",
+        "ogbench": tmp_path / "pointmaze-v0.npz",
         "npz": tmp_path / "plain.npz",
         "robomimic": tmp_path / "lift.hdf5",
         "hdf5": tmp_path / "plain.h5",
@@ -97,7 +97,7 @@ def test_names_are_downloaded(sources, tmp_path, monkeypatch):
     assert (data == load_lerobot(LEROBOT, tmp_path / "b", progress=False)).all()
     # One that is here already is not.
     data = open_dataset(
-        "ogbench://point-v0", tmp_path / "c", root=tmp_path, progress=False
+        "ogbench://pointmaze-v0", tmp_path / "c", root=tmp_path, progress=False
     )
     assert len(data) == 4
     with pytest.raises(FileNotFoundError, match=r"'cup-v0' is not at"):
@@ -117,6 +117,19 @@ def test_options_are_those_of_the_loader(sources, tmp_path):
         open_dataset(sources["robomimic"], tmp_path / "a")
     nested = open_dataset(sources["robomimic"], tmp_path / "a", overwrite=True)
     assert nested["observation", "object"].shape == (5, 3)
+
+
+def test_terminals_alone_are_not_those_of_ogbench(tmp_path, caplog):
+    arrays = {"next_observations": STATES, "terminals": ENDS}
+    for name, more in (("a", {}), ("b", {"qpos": STATES}), ("cube-single-v0", {})):
+        file = tmp_path / f"{name}.npz"
+        np.savez(file, observations=STATES, actions=ACTIONS, **arrays, **more)
+        caplog.clear()
+        with caplog.at_level("INFO", "torchrl_caiac"):
+            data = open_dataset(file, tmp_path / name, progress=False)
+        assert data["next", "terminated"].any() == (name == "a")
+        assert ("terminals end episodes as truncated" in caplog.text) == (name != "a")
+        assert "(--format)" in caplog.text
 
 
 def test_rewards_without_masks_are_not_those_of_ogbench(tmp_path):

@@ -31,7 +31,16 @@ _ARRAYS = {"observations", "actions"}
 # What OGBench's files and functions have.
 _OGBENCH = {"observations", "actions", "terminals"}
 _OGBENCH_MORE = {"next_observations", "valids", "rewards", "masks", "oracle_reps"}
-_OGBENCH_MORE |= {"qpos", "qvel", "button_states"}
+_OGBENCH_OWN = {"valids", "masks", "oracle_reps", "qpos", "qvel", "button_states"}
+_OGBENCH_MORE |= _OGBENCH_OWN
+# How the names of its datasets begin, some of whose files have nothing else.
+_OGBENCH_NAMES: tuple[str, ...] = (
+    "antmaze-",
+    "antsoccer-",
+    "humanoidmaze-",
+    "pointmaze-",
+)
+_OGBENCH_NAMES += ("cube-", "scene-", "puzzle-", "powderworld-", "visual-")
 
 
 class DatasetFormat(NamedTuple):
@@ -138,7 +147,15 @@ def open_dataset(
     if sign:
         options = {"download": True, **options}
     _check_options(known, options)
-    _logger.info("%s is read as %s", source, known.name)
+    _logger.info(
+        "%s is read as %s%s; name another format with format= (--format)",
+        source,
+        known.name,
+        # What differs from "npz", whose terminals say that a task ended.
+        ", whose terminals end episodes as truncated"
+        if known.name == "ogbench"
+        else "",
+    )
     return known.load(name if sign else source, path, **options)
 
 
@@ -281,7 +298,9 @@ def _is_ogbench(path: Path) -> bool:
     names = _names_in_npz(path)
     # OGBench has masks with its rewards. Others say with terminals that a task ended.
     has_own_rewards = "rewards" in names and "masks" not in names
-    return _OGBENCH <= names <= _OGBENCH | _OGBENCH_MORE and not has_own_rewards
+    is_own = bool(names & _OGBENCH_OWN) or path.name.startswith(_OGBENCH_NAMES)
+    fits = _OGBENCH <= names <= _OGBENCH | _OGBENCH_MORE
+    return fits and is_own and not has_own_rewards
 
 
 def _names_in_hdf5(path: Path) -> set[str]:
@@ -341,7 +360,8 @@ FORMATS: tuple[DatasetFormat, ...] = (
     ),
     DatasetFormat(
         "ogbench",
-        "ogbench://NAME, or a file .npz with observations, actions and terminals",
+        "ogbench://NAME, or a file .npz with observations, actions and terminals, and "
+        "with qpos, valids or the name of one of its datasets",
         _is_ogbench,
         load_ogbench,
         "ogbench",
