@@ -622,6 +622,30 @@ def test_all_ends_with_automatic_resets_are_counted() -> None:
     assert found.count == len(data) // LENGTH and found.rows[:2] == (29, 59)
 
 
+def test_resets_are_found_among_fast_velocities() -> None:
+    generator = torch.Generator().manual_seed(0)
+    speed = torch.randn(20, 31, 6, generator=generator)
+    place = 0.02 * speed[..., :2].cumsum(1) + torch.rand(20, 1, 2, generator=generator)
+    states = torch.cat([place, speed], -1)
+    data = TensorDict(
+        {
+            "observation": states[:, :-1],
+            "action": speed[:, 1:, :2].clamp(-1, 1),
+            "episode": torch.arange(20)[:, None].expand(-1, 30),
+            "next": {"observation": states[:, 1:]},
+        },
+        [20, 30],
+    ).reshape(-1)
+    layout = EntityLayout({"robot": range(8)}, fixed=["robot"])
+    assert "next_over_end" not in codes(data, layout)
+    data["next", "observation"] = data["observation"].roll(-1, 0)
+    assert "next_over_end" in codes(data, layout)
+    # Pieces of one long trajectory have no jumps.
+    long = torch.cat([0.02 * speed.view(-1, 6)[:, :2].cumsum(0), speed.view(-1, 6)], -1)
+    data["observation"], data["next", "observation"] = long[:600], long[1:601]
+    assert "next_over_end" not in codes(data, layout)
+
+
 # --- before fitting ------------------------------------------------------------------
 
 SILENT = ["next shuffled", "next over ends", "next zero", "next is state"]

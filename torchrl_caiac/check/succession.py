@@ -17,6 +17,8 @@ __all__ = ["Succession", "check_succession", "locate"]
 _NOISY = 0.05  # fewer exact next states than this: sensors with noise
 _RELATED = 0.5  # of the distance between rows of a trajectory
 _RESETS = 0.2  # of the trajectories: their ends jump further than most steps
+_FEWEST_ENDS = 5  # that tell resets by single columns
+_MORE_OFTEN = 4  # than elsewhere, do single columns jump where data are reset
 _PROBE = 2_000  # rows that tell whether next states are those of other rows
 
 
@@ -158,7 +160,8 @@ def _check_ends(
         # A long trajectory may be stored in pieces: only jumps show that it was reset.
         large = torch.quantile(usual[:1_000_000], 0.99)
         jumps = (change > large).double()
-        if len(ends) and bool((change > 2 * large).any()) and jumps.mean() > _RESETS:
+        is_far = bool((change > 2 * large).any()) and jumps.mean() > _RESETS
+        if len(ends) and (is_far or _single_jumps(states, ends, moves)):
             over[ends] = True
     if bool(over.any()):
         message = (
@@ -169,6 +172,22 @@ def _check_ends(
             finding("next_over_end", message, key=next_key, rows=sample.rows[over])
         )
     return findings, zero | over
+
+
+def _single_jumps(states: States, ends: torch.Tensor, moves: torch.Tensor) -> bool:
+    """Returns whether single columns jump at the ends, far more often than elsewhere.
+
+    The distance of all columns hides a reset of positions among fast velocities.
+    """
+    if len(ends) < _FEWEST_ENDS:
+        return False
+    moves = moves[:: -(-len(moves) // _PROBE)]
+    usual = (states.next[moves] - states.now[moves]).abs()
+    large = 2 * usual.float().quantile(0.99, dim=0) + states.tolerance
+    share = (usual > large).any(1).double().mean()
+    change = (states.next[ends] - states.now[ends]).abs()
+    jumps = (change > large).any(1).double().mean()
+    return bool(jumps > _RESETS) and bool(jumps > _MORE_OFTEN * share)
 
 
 def _check_inside(
