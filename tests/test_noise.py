@@ -88,11 +88,13 @@ def test_jitter_is_no_motion_beside_an_entity_that_moves() -> None:
     generator = torch.Generator().manual_seed(0)
     normal = torch.randn(2, ROWS, 1, generator=generator)
     change = torch.cat([0.05 * normal[0], 1e-6 * normal[1]], 1)
+    change = torch.cat([change, 3 * change[:, 1:]], 1)  # of another unit
     columns = {"arm": [0], "door": [1]}
     alone = resting_noise(transitions(change), EntityLayout(columns))["door"]
     assert alone.floor[0] < 1e-5
-    layout = EntityLayout(columns, positions=columns)
+    layout = EntityLayout({"arm": [0], "door": [1, 2]}, positions=columns)
     found = resting_noise(transitions(change), layout)
+    assert found["door"].floor[1] == pytest.approx(3 * found["door"].floor[0], rel=1e-3)
     assert found["door"].floor[0] == pytest.approx(0.05 * found["arm"].moving[0])
     assert found["door"].tolerance[0] == pytest.approx(0.002 * found["arm"].moving[0])
     assert found["door"].reason.endswith("a twentieth of the median change of 'arm'")

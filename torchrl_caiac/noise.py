@@ -168,7 +168,7 @@ def _beside_the_fastest(
         floor = _raised(noise.floor, own, _FLOOR_BESIDE * most)
         tolerance = _raised(noise.tolerance, own, _TOLERANCE_BESIDE * most)
         reason = noise.reason
-        if max(floor[c] for c in own) > max(noise.floor[c] for c in own):
+        if floor != noise.floor:
             reason += (
                 f"; raised to {_FLOOR_BESIDE * most:.3g}, a twentieth of the median "
                 f"change of {fastest!r}"
@@ -180,7 +180,11 @@ def _beside_the_fastest(
 def _raised(
     values: tuple[float, ...], places: list[int], least: float
 ) -> tuple[float, ...]:
-    return tuple(max(v, least) if c in places else v for c, v in enumerate(values))
+    """Raises the values of positions to a limit, other units by the same factor."""
+    factor = max(1.0, least / max(values[c] for c in places))
+    return tuple(
+        max(v, least) if c in places else factor * v for c, v in enumerate(values)
+    )
 
 
 def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDictBase:
