@@ -152,7 +152,7 @@ def test_no_room_for_more_ids(plain: ScoredDataset, tmp_path: Path) -> None:
     data = plain.data.exclude("caiac").to_tensordict()
     data["episode"] += 2**63 - 100
     scored = score(tmp_path / "others", data, LAYOUT)
-    with pytest.raises(ValueError, match="no room for 240 more"):
+    with pytest.raises(ValueError, match="cannot hold the 240 ids that follow"):
         augment_dataset(scored, tmp_path / "made", progress=False)
 
 

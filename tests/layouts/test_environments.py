@@ -93,7 +93,7 @@ def episode(env: Any, read: Callable[[Any], np.ndarray]) -> Callable[[], np.ndar
 
 
 def ogbench(name: str) -> Simulator:
-    import ogbench  # noqa: F401
+    import ogbench  # noqa: F401  # it registers the environments
 
     env: Any = gymnasium.make(f"{name}-v0").unwrapped
     env.reset(seed=0)
@@ -291,9 +291,11 @@ def robosuite_on_this_mujoco() -> Iterator[None]:
     from robosuite.utils import binding_utils
     from robosuite.utils.log_utils import ROBOSUITE_DEFAULT_LOGGER
 
+    def inertia(model: Any, out: np.ndarray, matrix: Any) -> None:
+        np.copyto(out, np.eye(len(out)))  # only controllers read it, and none acts
+
     ROBOSUITE_DEFAULT_LOGGER.setLevel(logging.ERROR)
     with pytest.MonkeyPatch.context() as patch:
-        inertia = lambda model, out, matrix: np.copyto(out, np.eye(len(out)))  # noqa: E731
         patch.setattr(mujoco, "mj_fullM", inertia)
         patch.setattr(binding_utils.MjData, "qM", None, raising=False)
         yield

@@ -244,9 +244,9 @@ def _first_id(ids: torch.Tensor, number: int) -> int:
         largest = torch.iinfo(ids.dtype).max
     if first + number - 1 > largest:
         raise ValueError(
-            f"'episode' has ids up to {first - 1}, and its type {ids.dtype} has no "
-            f"room for {number} more: number the trajectories from 0, or leave out the "
-            "originals"
+            f"'episode' has ids up to {first - 1}, and its type {ids.dtype} "
+            f"cannot hold the {number} ids that follow: number the trajectories from "
+            "0, or leave out the originals"
         )
     return first
 

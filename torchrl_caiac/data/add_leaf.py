@@ -161,7 +161,8 @@ def store_leaves(data: TensorDictBase) -> list[NestedKey]:
         for key, leaf in added:
             new_leaf(data, key, leaf.shape, leaf.dtype).copy_(leaf)
     except BaseException:
-        with contextlib.suppress(Exception):
+        # A parent may hold the lock; the error that led here is the one to raise.
+        with contextlib.suppress(RuntimeError):
             data.unlock_()
         for key, entry in dropped:
             data.set(key, entry)  # as it was, in memory

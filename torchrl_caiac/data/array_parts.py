@@ -94,7 +94,7 @@ class LostRows:
     rewards: bool = False
 
     def told(self, parts: Iterator[Part]) -> Iterator[Part]:
-        """Yields the parts, and then writes to the log what was left out."""
+        """Yields the parts, then logs how many rows were left out."""
         yield from parts
         if not self.episodes:
             return

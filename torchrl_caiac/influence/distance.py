@@ -12,7 +12,41 @@ from torch import nn
 
 from torchrl_caiac.entities import EntityLayout
 
-__all__ = ["DistanceInfluence"]
+__all__ = ["DistanceInfluence", "checked_agent"]
+
+
+def checked_agent(layout: EntityLayout, agent: str | None) -> str:
+    """Returns the entity that the action moves, after checking it.
+
+    Args:
+        layout (EntityLayout): the entities.
+        agent (str, optional): its name. ``None``: the layout's only ``fixed`` entity.
+
+    Returns:
+        str: the name.
+
+    Raises:
+        ValueError: it is not an entity, or the layout has not exactly one fixed one.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.influence.distance import checked_agent
+        >>> checked_agent(EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"]), None)
+        'arm'
+    """
+    if agent is None:
+        if len(layout.fixed) != 1:
+            raise ValueError(
+                f"the layout has {len(layout.fixed)} fixed entities "
+                f"{list(layout.fixed)}: pass the one that the action moves as agent"
+            )
+        return layout.fixed[0]
+    if agent not in layout.names:
+        raise ValueError(
+            f"agent is {agent!r}, which is not an entity: the layout has "
+            f"{list(layout.names)}"
+        )
+    return agent
 
 
 class DistanceInfluence(nn.Module):
@@ -87,18 +121,7 @@ class DistanceInfluence(nn.Module):
                     f"positions give entity {name!r} the columns {foreign}, which it "
                     "does not have: give columns of the entity"
                 )
-        if agent is None:
-            if len(layout.fixed) != 1:
-                raise ValueError(
-                    f"the layout has {len(layout.fixed)} fixed entities "
-                    f"{list(layout.fixed)}: pass the one that the action moves as agent"
-                )
-            agent = layout.fixed[0]
-        if agent not in layout.names:
-            raise ValueError(
-                f"agent is {agent!r}, which is not an entity: the layout has "
-                f"{list(layout.names)}"
-            )
+        agent = checked_agent(layout, agent)
         if not (distance > 0 and math.isfinite(distance)):
             raise ValueError(f"distance must be positive and finite, got {distance!r}")
         self.agent = agent

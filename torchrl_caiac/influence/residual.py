@@ -17,6 +17,7 @@ from typing_extensions import Self
 
 from torchrl_caiac._layout_units import position_features
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.distance import checked_agent
 from torchrl_caiac.influence.motion import MotionInfluence, Tolerance
 from torchrl_caiac.noise import sample_rows
 
@@ -142,7 +143,7 @@ class ResidualInfluence(MotionInfluence):
         if far is not None:
             if not 0 < far < math.inf:
                 raise ValueError(f"far must be positive and finite, got {far!r}")
-            self.agent = _checked_agent(layout, agent)
+            self.agent = _far_agent(layout, agent)
         self.entities: nn.ModuleList | None = None
 
     @property
@@ -298,19 +299,9 @@ class ResidualInfluence(MotionInfluence):
         )
 
 
-def _checked_agent(layout: EntityLayout, agent: str | None) -> str:
-    if agent is None:
-        if len(layout.fixed) != 1:
-            raise ValueError(
-                f"the layout has {len(layout.fixed)} fixed entities "
-                f"{list(layout.fixed)}: pass the one that the action moves as agent"
-            )
-        agent = layout.fixed[0]
-    elif agent not in layout.names:
-        raise ValueError(
-            f"agent is {agent!r}, which is not an entity: the layout has "
-            f"{list(layout.names)}"
-        )
+def _far_agent(layout: EntityLayout, agent: str | None) -> str:
+    """Returns the agent, if its distance from the other entities is known."""
+    agent = checked_agent(layout, agent)
     sizes = {name: len(layout.positions.get(name, ())) for name in layout.names}
     if len(set(sizes.values())) != 1 or not sizes[agent]:
         raise ValueError(
