@@ -10,6 +10,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
+from torchrl.envs import Transform
 
 from environments.base import Environment
 from methods.base import Method
@@ -66,6 +67,25 @@ class Learner(ABC):
     def rows(self) -> TensorDictBase:
         """Returns the training data, by default those of the environment."""
         return self.environment.rows()
+
+    def counterfactuals(self, **options: Any) -> Transform | None:
+        """Returns the method's transform with the settings of the environment.
+
+        Args:
+            **options (Any): further arguments of the transform, such as ``window``.
+
+        Returns:
+            Transform, optional: to append to the buffer; ``None`` without augmentation.
+        """
+        settings = self.augmentation
+        if settings.get("lookahead") is not None:
+            options["lookahead"] = settings.lookahead
+        return self.method.transform(
+            self.environment.layout,
+            settings.counterfactual_ratio,
+            swap_prob=settings.swap_prob,
+            **options,
+        )
 
     @abstractmethod
     def make_buffer(self, rows: TensorDictBase) -> ReplayBuffer:

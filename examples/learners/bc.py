@@ -1,0 +1,63 @@
+"""Goal-conditioned behaviour cloning."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import BCLoss
+
+from learners.goal_conditioned import GoalConditioned, descend
+from learners.imitation import has_own_goals, imitation_buffer
+from torchrl_caiac.transforms import WindowGoal
+
+__all__ = ["BC"]
+
+
+class _Loss(BCLoss):
+    # Without it TorchRL warns that its own class does not name it.
+    target_actor_network_params: TensorDictParams | None
+
+
+class BC(GoalConditioned):
+    """Repeats the actions of demonstrations, of counterfactual ones too."""
+
+    def rows(self) -> TensorDictBase:
+        """Returns what learning reads of the demonstrations, in memory."""
+        own = has_own_goals(self.settings)
+        return self.read_leaves(self.environment.demonstrations(), goals=own)
+
+    def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
+        """Makes the buffer of transitions, their goals, and counterfactuals."""
+        goals = None
+        if not has_own_goals(self.settings):
+            goals = WindowGoal(
+                self.environment.layout,
+                window=1,
+                mixture=dict(self.settings.future_goals),
+            )
+        return imitation_buffer(self, rows, batch_size=self.rows_at_once, goals=goals)
+
+    def setup(self, rows: TensorDictBase, seed: int) -> None:
+        """Makes the policy, with the statistics of some batches."""
+        features = self.start(rows, seed)
+        self.actor = self.make_actor(features)
+        self.loss_module = _Loss(self.actor, loss_function="l2")
+        self.optimizer = torch.optim.Adam(
+            self.loss_module.parameters(), lr=self.settings.lr, fused=True
+        )
+        self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(
+            self.optimizer, self.settings.steps
+        )
+        self.parts = {
+            "loss": self.loss_module,
+            "optimizer": self.optimizer,
+            "scheduler": self.scheduler,
+        }
+
+    def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
+        """Takes one step of Adam."""
+        loss = self.loss_module(batch)["loss_bc"]
+        descend(self.optimizer, loss)
+        self.scheduler.step()
+        return {"loss_bc": loss.detach(), **self.share_swapped(batch)}
