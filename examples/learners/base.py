@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Transform
 
@@ -36,6 +37,14 @@ class Learner(ABC):
 
     extendable: ClassVar[bool] = False
     """Whether ``steps`` may be raised later, for finished runs to be extended."""
+
+    reads: ClassVar[tuple[NestedKey, ...]] = (
+        "observation",
+        "action",
+        "episode",
+        *[("next", name) for name in ("observation", "done")],
+    )
+    """The leaves of the rows that learning reads, besides scores and goals."""
 
     def __init__(
         self,
@@ -67,6 +76,35 @@ class Learner(ABC):
     def rows(self) -> TensorDictBase:
         """Returns the training data, by default those of the environment."""
         return self.environment.rows()
+
+    def read_leaves(
+        self, rows: TensorDictBase, *further: NestedKey, goals: bool = True
+    ) -> TensorDictBase:
+        """Returns what learning reads of the rows, in memory.
+
+        Args:
+            rows (TensorDictBase): all rows, ``[T]``.
+            *further (NestedKey): leaves besides :attr:`reads`.
+
+        Keyword Args:
+            goals (bool): whether desired goals are among them.
+
+        Raises:
+            KeyError: a leaf is missing.
+        """
+        scores = [] if self.method.score_key is None else [self.method.score_key]
+        desired: list[NestedKey] = ["desired_goal"] if goals else []
+        keys = [*self.reads, *desired, *scores, *further]
+        present = rows.keys(include_nested=True)
+        missing = [key for key in keys if key not in present]
+        if missing:
+            raise KeyError(
+                f"the rows of {type(self.environment).__name__} lack {missing}, which "
+                f"learner={self.settings.name} reads: score the data first (score.py), "
+                "and for desired goals choose learner.goals=future if the learner has "
+                "it"
+            )
+        return rows.select(*keys).clone()
 
     def counterfactuals(self, **options: Any) -> Transform | None:
         """Returns the method's transform with the settings of the environment.

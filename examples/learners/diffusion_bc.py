@@ -50,7 +50,9 @@ class ScoreNetwork(nn.Module):
         rest, step = value[..., :-1], value[..., -1:]
         powers = torch.arange(_FREQUENCIES, dtype=value.dtype, device=value.device)
         angle = 0.5 * math.pi * step / self.steps * 2.0**powers
-        noise: torch.Tensor = self.network(torch.cat([rest, angle.sin(), angle.cos()], -1))
+        noise: torch.Tensor = self.network(
+            torch.cat([rest, angle.sin(), angle.cos()], -1)
+        )
         return noise
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -26,44 +26,8 @@ class GoalConditioned(Learner):
     ``batches_at_once``, ``hidden_sizes`` and ``hidden_dtype``.
     """
 
-    reads: ClassVar[tuple[NestedKey, ...]] = (
-        "observation",
-        "action",
-        "episode",
-        *[("next", name) for name in ("observation", "done")],
-    )
-    """The leaves of the rows that learning reads, besides scores and goals."""
     rb: ReplayBuffer
     actor: GoalConditionedActor
-
-    def read_leaves(
-        self, rows: TensorDictBase, *further: NestedKey, goals: bool = True
-    ) -> TensorDictBase:
-        """Returns what learning reads of the rows, in memory.
-
-        Args:
-            rows (TensorDictBase): all rows, ``[T]``.
-            *further (NestedKey): leaves besides :attr:`reads`.
-
-        Keyword Args:
-            goals (bool): whether desired goals are among them.
-
-        Raises:
-            KeyError: a leaf is missing.
-        """
-        scores = [] if self.method.score_key is None else [self.method.score_key]
-        desired: list[NestedKey] = ["desired_goal"] if goals else []
-        keys = [*self.reads, *desired, *scores, *further]
-        present = rows.keys(include_nested=True)
-        missing = [key for key in keys if key not in present]
-        if missing:
-            raise KeyError(
-                f"the rows of {type(self.environment).__name__} lack {missing}, which "
-                f"learner={self.settings.name} reads: score the data first (score.py), "
-                "and for desired goals choose learner.goals=future if the learner has "
-                "it"
-            )
-        return rows.select(*keys).clone()
 
     def check_strides(self) -> None:
         """Raises if a run could stop in the middle of a sample."""
