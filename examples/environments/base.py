@@ -94,6 +94,10 @@ class Environment(ABC):
         """Returns the same transitions with desired goals and rewards."""
         return self.rows()
 
+    def demonstrations(self) -> TensorDictBase:
+        """Returns the transitions that imitation learners train on."""
+        return self.goal_rows()
+
     def model_rows(self) -> list[TensorDictBase]:
         """Returns the datasets that world models are fitted to."""
         return [self.rows()]
