@@ -70,12 +70,19 @@ class Learner(ABC):
             "augmentation": OmegaConf.to_container(self.augmentation, resolve=True),
             "seed": seed,
             "layout": self.environment.layout.to_dict(),
-            "data": content_digests(self.environment.rows(), self.method.score_key),
+            "data": content_digests(self.stored_rows(), self.method.score_key),
         }
 
-    def rows(self) -> TensorDictBase:
-        """Returns the training data, by default those of the environment."""
+    def stored_rows(self) -> TensorDictBase:
+        """Returns the memory-mapped transitions that the method scores.
+
+        Defaults to all rows of the environment.
+        """
         return self.environment.rows()
+
+    def rows(self) -> TensorDictBase:
+        """Returns the training data, by default :meth:`stored_rows`."""
+        return self.stored_rows()
 
     def read_leaves(
         self, rows: TensorDictBase, *further: NestedKey, goals: bool = True

@@ -25,10 +25,14 @@ class BC(GoalConditioned):
     window = 1
     """Rows that follow each other, from which a row to learn from is made."""
 
+    def stored_rows(self) -> TensorDictBase:
+        """Returns the demonstrations."""
+        return self.environment.demonstrations()
+
     def rows(self) -> TensorDictBase:
         """Returns what learning reads of the demonstrations, in memory."""
         own = has_own_goals(self.settings)
-        return self.read_leaves(self.environment.demonstrations(), goals=own)
+        return self.read_leaves(self.stored_rows(), goals=own)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of transitions, their goals, and counterfactuals."""
@@ -52,8 +56,11 @@ class BC(GoalConditioned):
         features = self.start(rows, seed)
         self.actor = self.make_actor(features)
         self.loss_module = self.make_loss()
-        self.optimizer = torch.optim.Adam(
-            self.loss_module.parameters(), lr=self.settings.lr, fused=True
+        self.optimizer = torch.optim.AdamW(
+            self.loss_module.parameters(),
+            lr=self.settings.lr,
+            weight_decay=self.settings.weight_decay,
+            fused=True,
         )
         self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(
             self.optimizer, self.settings.steps
@@ -69,7 +76,7 @@ class BC(GoalConditioned):
         return _BCLoss(self.actor, loss_function="l2")
 
     def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
-        """Takes one step of Adam."""
+        """Takes one step of AdamW."""
         losses = self.loss_module(batch)
         (name,) = losses.keys()
         descend(self.optimizer, losses[name])

@@ -21,9 +21,13 @@ __all__ = ["LMP"]
 class LMP(Learner):
     """Plans for windows of trajectories, whose goals are later states."""
 
+    def stored_rows(self) -> TensorDictBase:
+        """Returns the demonstrations."""
+        return self.environment.demonstrations()
+
     def rows(self) -> TensorDictBase:
         """Returns what learning reads of the demonstrations, in memory."""
-        return self.read_leaves(self.environment.demonstrations(), goals=False)
+        return self.read_leaves(self.stored_rows(), goals=False)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of windows, their goals, and counterfactuals."""
