@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 from types import SimpleNamespace
 
 import pytest
@@ -92,16 +93,21 @@ def make(steps, cfg, seed=0):
     return learner
 
 
-@pytest.mark.parametrize("method", ["motion", "none"])
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
-@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize(
+    ("environment", "learner", "method"),
+    [
+        *product(ENVIRONMENTS, LEARNERS, ["motion"]),
+        *[("fetch_push", learner, "none") for learner in ("bc", "td3_bc")],
+    ],
+)
 def test_an_interrupted_run_ends_as_one_that_was_not(
-    learner, environment, method, configure, steps, monkeypatch
+    environment, learner, method, configure, steps, monkeypatch
 ):
     cfg = configure(environment, learner, method=method)
     whole = steps.train.train(cfg, method, 1)
     state = whole.policy_state()
     assert all(isinstance(value, torch.Tensor) for value in state.values())
+    assert all(value.isfinite().all() for value in state.values())
     folder = steps.parts.run_folder(cfg, method, 1)
     folder.rename(folder.with_name("whole"))
     take_step = type(whole).step
@@ -124,8 +130,9 @@ def test_an_interrupted_run_ends_as_one_that_was_not(
     assert changed
     # Without setup, the saved policy is the trained one.
     loaded = steps.train.load_policy(cfg, method, 1, 12).state_dict()
+    prefix = "model." if learner == "lmp" else ""
     for key, value in state.items():
-        assert torch.equal(loaded[key], value), key
+        assert torch.equal(loaded[prefix + key], value), key
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -165,6 +172,7 @@ def test_cloning_against_a_plain_loop(configure, steps):
         for weight, (m, v), g in zip(weights, moments, gradients, strict=True):
             m.mul_(0.9).add_(0.1 * g)
             v.mul_(0.999).add_(0.001 * g * g)
+            weight.data.mul_(1 - lr * cfg.learner.weight_decay)
             size = (v / (1 - 0.999**step)).sqrt() + 1e-8
             weight.data.sub_(lr * m / (1 - 0.9**step) / size)
         scalars = learner.step(batch, step)
@@ -177,7 +185,8 @@ def test_cloning_against_a_plain_loop(configure, steps):
 @pytest.mark.parametrize("learner", ["bc", "diffusion_bc"])
 def test_goals_follow_the_swap(learner, configure, steps):
     """A swapped cube has a goal of its donor's episode, the others that of the row."""
-    cfg = configure("fetch_push", learner, "learner.batch_size=64")
+    half = "env.augmentation.counterfactual_ratio=0.5"
+    cfg = configure("fetch_push", learner, "learner.batch_size=64", half)
     made = make(steps, cfg)
     layout, rows = made.environment.layout, made.rows()
     batch = next(made.batches())
@@ -187,6 +196,7 @@ def test_goals_follow_the_swap(learner, configure, steps):
         ((rows["action"] - row["action"]).abs().sum(-1) < 1e-6).nonzero().item()
         for row in batch.unbind(0)
     ]
+    moved = 0
     for n, name in enumerate(layout.names):
         if name in layout.fixed:
             assert not swapped[:, n].any()
@@ -197,10 +207,13 @@ def test_goals_follow_the_swap(learner, configure, steps):
                 -1
             )
             source = same.nonzero().item()
-            assert (source == own[i]) != bool(swapped[i, n])
+            # A row that was drawn twice may be its own donor.
+            assert bool(swapped[i, n]) or source == own[i]
+            moved += source != own[i]
             assert torch.equal(
                 rows["desired_goal"][source, goal], row["desired_goal"][goal]
             )
+    assert moved > 0
 
 
 def test_goals_of_the_future(configure, steps):
@@ -210,7 +223,7 @@ def test_goals_of_the_future(configure, steps):
     cfg.learner.future_goals = {"uniform": 1.0}
     made = make(steps, cfg)
     rows = made.rows()
-    assert "desired_goal" not in rows.keys()
+    assert "desired_goal" not in rows
     achieved = made.environment.layout.achieved_goal(rows, next=True)
     offsets = []
     for batch, _ in zip(made.batches(), range(8), strict=False):
@@ -275,8 +288,8 @@ def test_a_share_of_rows_is_of_successful_episodes(modules):
     # 0.7, and a tenth of the other 0.3.
     assert part[index].float().mean().item() == pytest.approx(0.73, abs=0.02)
     assert len(index[part[index]].unique()) == 100
-    assert len(index.unique()) == 1000
-    with pytest.raises(ValueError, match=r"no row .* successful is 0.7"):
+    assert len(index.unique()) > 990
+    with pytest.raises(ValueError, match=r"no row .*successful is 0.7"):
         modules.hindsight.ShareSampler(torch.zeros(5, dtype=torch.bool), 0.7)
 
 
