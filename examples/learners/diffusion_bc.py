@@ -59,7 +59,7 @@ class ScoreNetwork(nn.Module):
 
 
 class DiffusionBC(BC):
-    """Draws chunks of actions by diffusion; plays the first actions of each.
+    """Makes chunks of actions by diffusion; plays the first actions of each.
 
     A row is the first state of a window with the actions of the whole window. All rows
     of a window are swapped together, so the method's rule holds for the whole chunk.
@@ -97,6 +97,7 @@ class DiffusionBC(BC):
             size=self.window,
             execute=settings.execute,
             action_dim=action_dim,
+            sample=settings.sample,
         )
 
     def make_loss(self) -> DiffusionBCLoss:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import InteractionType, TensorDictModule, interaction_type
 from torchrl.data import TensorStorage
 
 EPISODES, STEPS = 12, 15
@@ -365,6 +365,20 @@ class TestChunkActor:
         expected = torch.tensor([-1, -0.9, -0.98, -0.88, -0.78])
         torch.testing.assert_close(actions[:, 1], expected)
         assert self.calls == [2, 1, 1]
+
+    @pytest.mark.parametrize("sample", [True, False])
+    def test_random_chunks(self, modules, sample):
+        def plan(start):
+            random = interaction_type() is InteractionType.RANDOM
+            return torch.rand(len(start), 4) if random else torch.zeros(len(start), 4)
+
+        policy = TensorDictModule(plan, ["observation"], ["chunk"])
+        actor = modules.chunks.ChunkActor(
+            policy, size=4, execute=1, action_dim=1, sample=sample
+        )
+        td = TensorDict({"observation": torch.zeros(2, 1)}, [2])
+        td["is_init"] = torch.ones(2, 1, dtype=torch.bool)
+        assert bool(actor(td)["action"].any()) == sample
 
     def test_a_lost_chunk_is_refused(self, actor):
         td = TensorDict({"observation": torch.zeros(2, 1)}, [2])
