@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from tensordict import TensorDict
-from tensordict.nn import InteractionType, TensorDictModule, interaction_type
+from tensordict.nn import InteractionType, TensorDictModule
+from tensordict.nn.probabilistic import interaction_type
 from torchrl.data import TensorStorage
 
 EPISODES, STEPS = 12, 15
