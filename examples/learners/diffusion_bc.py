@@ -65,14 +65,14 @@ class DiffusionBC(BC):
     of a window are swapped together, so the method's rule holds for the whole chunk.
     """
 
-    actor: ChunkActor  # type: ignore[assignment]
+    actor: ChunkActor
 
     @property
-    def window(self) -> int:  # type: ignore[override]
+    def window(self) -> int:
         """The number of actions in a chunk."""
         return int(self.settings.chunk)
 
-    def make_actor(  # type: ignore[override]
+    def make_actor(
         self, features: GoalFeatures, action_key: NestedKey = "action"
     ) -> ChunkActor:
         """Returns the policy, which carries its chunk from step to step."""
