@@ -159,9 +159,7 @@ class OGBench(Environment):
             num_workers=self.workers if self.workers > 1 else 0,
         )
 
-    def distance_rule(
-        self, *, action_only: bool
-    ) -> DistanceInfluence | HandleDistance:
+    def distance_rule(self, *, action_only: bool) -> DistanceInfluence | HandleDistance:
         """Returns the rule of distance between the hand and the entities, 5 cm."""
         if not self.settings.scene.startswith("cube-"):
             return HandleDistance(self.settings.scene, action_only=action_only)

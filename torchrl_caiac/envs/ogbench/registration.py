@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 from torchrl_caiac.layouts import layout_names
@@ -93,12 +94,38 @@ def make_ogbench_task(name: str) -> Any:
     """
     check_name(name)
     gymnasium = _import_ogbench()
+    spec = copy.deepcopy(gymnasium.spec(name + _VERSION))
+    load = gymnasium.envs.registration.load_env_creator
+    spec.entry_point = _with_equal_goals(load(spec.entry_point))
     return gymnasium.make(
-        name + _VERSION,
+        spec,
         use_oracle_rep=True,
         visualize_info=False,
         disable_env_checker=True,
     )
+
+
+def _with_equal_goals(kind: Any) -> Any:
+    """Returns a class of environments whose goals depend on the seed alone.
+
+    To find a goal, OGBench takes two random steps, with actions that nothing seeds.
+    """
+
+    class EqualGoals(kind):  # type: ignore[misc]
+        _actions: Any = None
+
+        @property
+        def action_space(self) -> Any:
+            if self._actions is None:
+                self._actions = super().action_space
+            return self._actions
+
+        def reset(self, *args: Any, seed: int | None = None, **options: Any) -> Any:
+            if seed is not None:
+                self.action_space.seed(seed)
+            return super().reset(*args, seed=seed, **options)
+
+    return EqualGoals
 
 
 def check_name(name: str) -> None:
