@@ -176,7 +176,6 @@ class OGBench(Environment):
         split: Literal["validation", "test"] = "test",
     ) -> list[dict[str, Any]]:
         """Plays the tasks from the same starts for all runs; the splits have others."""
-        settings = self.settings.evaluate
         torch.manual_seed(seed)
         results = []
         seeds = self._seeds(split)

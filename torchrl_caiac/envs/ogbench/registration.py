@@ -111,7 +111,7 @@ def _with_equal_goals(kind: Any) -> Any:
     To find a goal, OGBench takes two random steps, with actions that nothing seeds.
     """
 
-    class EqualGoals(kind):  # type: ignore[misc]
+    class EqualGoals(kind):
         _actions: Any = None
 
         @property
