@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -16,7 +16,9 @@ from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer
 
-__all__ = ["Environment", "Evaluation"]
+__all__ = ["Environment", "Evaluation", "Split"]
+
+Split = Literal["validation", "test"]
 
 
 class Evaluation(NamedTuple):
@@ -94,6 +96,13 @@ class Environment(ABC):
         """Returns the same transitions with desired goals and rewards."""
         return self.rows()
 
+    def demonstrations(self) -> TensorDictBase:
+        """Returns the transitions that imitation learners copy, memory-mapped.
+
+        Methods score them. Defaults to :meth:`rows`.
+        """
+        return self.rows()
+
     def model_rows(self) -> list[TensorDictBase]:
         """Returns the datasets that world models are fitted to."""
         return [self.rows()]
@@ -124,7 +133,9 @@ class Environment(ABC):
         return held_out["oracle", "score"] > 0.5
 
     @abstractmethod
-    def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
+    def play(
+        self, actor: Any, seed: int, folder: Path, *, split: Split = "test"
+    ) -> list[dict[str, Any]]:
         """Plays the episodes of an evaluation.
 
         Args:
@@ -132,8 +143,24 @@ class Environment(ABC):
             seed (int): of the run.
             folder (Path): for figures of episodes, if any.
 
+        Keyword Args:
+            split (str): ``"test"``, whose starts are reported, or ``"validation"``, on
+                which choices are made; they have no start in common.
+
         Returns:
             list of dict: one dictionary for each episode, JSON values.
+        """
+
+    @abstractmethod
+    def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Summarises the episodes of an evaluation.
+
+        Args:
+            episodes (sequence of dict): from :meth:`play`.
+
+        Returns:
+            list of dict: ``"task"``, ``"measure"``, the number of ``"episodes"``, and
+            the mean ``"value"``.
         """
 
     @abstractmethod
