@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 
-from environments.base import Environment, Evaluation, compare_methods
+from environments.base import Environment, Evaluation, Split, compare_methods
 from shared.settings import keep_settings
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_ogbench, load_transitions, write_transitions
@@ -173,7 +173,7 @@ class OGBench(Environment):
         seed: int,
         folder: Path,
         *,
-        split: Literal["validation", "test"] = "test",
+        split: Split = "test",
     ) -> list[dict[str, Any]]:
         """Plays the tasks from the same starts for all runs; the splits have others."""
         torch.manual_seed(seed)
@@ -189,7 +189,7 @@ class OGBench(Environment):
         settings = self.settings.evaluate
         starts = {
             "test": (settings.seed, settings.episodes),
-            "validation": (settings.validation_seed, settings.validation_episodes),
+            "validation": (settings.validation.seed, settings.validation.episodes),
         }
         if split not in starts:
             raise ValueError(f"split is {split!r}, expected one of {list(starts)}")
@@ -197,7 +197,7 @@ class OGBench(Environment):
         if set(spans[0]) & set(spans[1]):
             raise ValueError(
                 f"env.evaluate: the seeds of the validation starts, {spans[1]}, are "
-                f"also some of the test starts, {spans[0]}: change validation_seed"
+                f"also some of the test starts, {spans[0]}: change validation.seed"
             )
         unknown = set(settings.tasks) - set(range(1, TASKS + 1))
         if unknown or not settings.tasks:
@@ -216,7 +216,7 @@ class OGBench(Environment):
         while len(self._envs) < number:
             self._envs.append(make_ogbench_task(self.settings.scene))
 
-    def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Returns the success of each task."""
         results = []
         for task in dict.fromkeys(episode["task"] for episode in episodes):

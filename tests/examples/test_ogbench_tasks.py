@@ -231,7 +231,7 @@ def test_starts_depend_on_the_split_alone(steps, compose, tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "match"),
     [
-        ({"validation_seed": 1_000_009}, "change validation_seed"),
+        ({"validation": {"seed": 1_000_009}}, "change validation.seed"),
         ({"tasks": [0, 1]}, r"expected some of 1 to 5"),
         ({"tasks": []}, r"expected some of 1 to 5"),
     ],
