@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 import gc
 from collections.abc import Sequence
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from minari import MinariDataset
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import SerialEnv, TransformedEnv
 
 from environments.base import Environment, Evaluation, compare_methods
+from environments.playing import Split, play_together
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import RenderingUnavailable
@@ -31,7 +31,6 @@ from torchrl_caiac.envs.kitchen import (
     create_kitchen_random,
     kitchen_reward,
     kitchen_transitions,
-    make_kitchen_env,
 )
 from torchrl_caiac.influence import DistanceInfluence, SimulatorInfluence
 from torchrl_caiac.plotting import bootstrap_interval, plot_frames, plot_influence
@@ -132,21 +131,59 @@ class Kitchen(Environment):
         """Returns the rule of distance between the hand and the handles of objects."""
         return HandleDistance(action_only=action_only)
 
-    def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
-        """Plays all tasks. Success means that all objects are at their goals."""
+    def play(
+        self, actor: Any, seed: int, folder: Path, *, split: Split = "test"
+    ) -> list[dict[str, Any]]:
+        """Plays all tasks. Success means that all objects are at their goals.
+
+        Runs with another seed have other starts, and so have the two splits.
+        """
         settings = self.settings.evaluate
+        seeds = self.start_seeds(seed, split)
+        kitchens = [KitchenEnv() for _ in seeds]
         episodes: list[dict[str, Any]] = []
-        for task in settings.tasks:
-            episodes += play_task(
-                actor,
-                task,
-                start=settings.start,
-                episodes=settings.episodes,
-                seed=settings.seed + seed,
-                strips=settings.strips,
-                folder=folder,
-            )
+        try:
+            for task in settings.tasks:
+                torch.manual_seed(seeds[0])
+                played = play_task(actor, kitchens, task, settings.start, seeds)
+                episodes += [result for result, _ in played]
+                for number, (_, states) in enumerate(played[: settings.strips]):
+                    draw_strip(folder / f"{split}-{task}-{number}.png", states)
+        finally:
+            close(kitchens)
         return episodes
+
+    def start_seeds(self, seed: int, split: Split) -> range:
+        """Returns the seeds of the starts of a run, which no other split or run has."""
+        settings = self.settings.evaluate
+        first, episodes = {
+            "test": (settings.seed, settings.episodes),
+            "validation": (settings.validation_seed, settings.validation_episodes),
+        }[split]
+        seeds = range(first + seed * episodes, first + (seed + 1) * episodes)
+        if split == "test" and seeds.stop > settings.validation_seed:
+            raise ValueError(
+                f"the test starts have the seeds {seeds.start} to {seeds.stop - 1}, "
+                "which must be below those of the validation starts: raise "
+                f"env.evaluate.validation_seed, which is {settings.validation_seed}"
+            )
+        return seeds
+
+    def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Returns success over all objects, and over the task's own, by task."""
+        rows = []
+        for task in dict.fromkeys(episode["task"] for episode in episodes):
+            mine = [episode for episode in episodes if episode["task"] == task]
+            rows += [
+                {
+                    "task": task,
+                    "measure": measure,
+                    "episodes": len(mine),
+                    "value": sum(episode[measure] for episode in mine) / len(mine),
+                }
+                for measure in ("success", "task_success")
+            ]
+        return rows
 
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """Returns one line for each episode."""
@@ -247,11 +284,7 @@ class Kitchen(Environment):
             states += [shown[0], made[torch.cdist(made, shown).argmax()]]
             name = task.replace("_", " ")
             titles += [f"{name}, demonstration", f"{name}, counterfactual"]
-        kitchen = KitchenEnv(render_mode="rgb_array")
-        try:
-            frames = kitchen.render_states(torch.stack(states).numpy())
-        finally:
-            kitchen.close()
+        frames = render(torch.stack(states).numpy())
         plot_frames(frames, titles).savefig(path, dpi=150, bbox_inches="tight")
 
 
@@ -291,67 +324,85 @@ class HandleDistance:
 
 def play_task(
     actor: Any,
+    kitchens: Sequence[KitchenEnv],
     task: str,
-    *,
-    start: str,
-    episodes: int,
-    seed: int,
-    strips: int,
-    folder: Path,
-) -> list[dict[str, Any]]:
-    """Plays episodes of one task in parallel; returns one result for each."""
-    torch.manual_seed(seed)
-    threads = torch.get_num_threads()
-    base = SerialEnv(episodes, partial(make_kitchen_env, task, start=start))
-    env = base
-    if hasattr(actor, "make_tensordict_primer"):
-        env = TransformedEnv(base, actor.make_tensordict_primer())
-    env.set_seed(seed)
-    try:
-        with torch.no_grad():
-            rollout = env.rollout(10_000, actor, break_when_all_done=True)
-    finally:
-        env.close()
-        # TorchRL gives torch more threads when environments close, and processes that
-        # run in parallel then wait for each other's.
-        torch.set_num_threads(threads)
-        # A kitchen has 60 MB that Python's garbage collector does not track.
-        del env, base
-        gc.collect()
-    after = rollout["next"]
-    results = []
-    for number in range(episodes):
-        done = after["done"][number, :, 0].nonzero()
-        length = int(done[0]) + 1
-        wrong = after["wrong_tasks"][number, length - 1]
-        results.append(
-            {
-                "task": task,
-                "episode": number,
-                "success": bool(after["success"][number, length - 1]),
-                "task_success": bool(after["task_success"][number, :length].any()),
-                "wrong_tasks": [
-                    name
-                    for name, was_done in zip(KITCHEN_TASKS, wrong, strict=True)
-                    if was_done
-                ],
-                "steps": length,
-            }
-        )
-        if number < strips:
-            shown = torch.linspace(0, length - 1, 6).round().long()
-            kitchen = KitchenEnv(task, render_mode="rgb_array")
-            try:
-                frames = kitchen.render_states(
-                    after["observation"][number, shown].numpy()
+    start: Any,
+    seeds: Sequence[int],
+) -> list[tuple[dict[str, Any], np.ndarray]]:
+    """Plays a task in each kitchen.
+
+    An episode ends when all objects are at their goals, or after 280 steps.
+
+    Args:
+        actor (TensorDictModule): the policy.
+        kitchens (sequence of KitchenEnv): one for each episode.
+        task (str): the task.
+        start (Any): of the episodes, see :class:`~torchrl_caiac.envs.KitchenEnv`.
+        seeds (sequence of int): of the starts and of the noise, one for each episode.
+
+    Returns:
+        list of tuple: the result of each episode, and its states ``[L + 1, 30]``.
+    """
+    options = {"task": task, "start": start}
+    firsts = [
+        kitchen.reset(seed=seed, options=options)[0]
+        for kitchen, seed in zip(kitchens, seeds, strict=True)
+    ]
+    states = [[first["observation"]] for first in firsts]
+    flags: list[list[dict[str, Any]]] = [[] for _ in kitchens]
+
+    def step(number: int, action: np.ndarray) -> tuple[dict[str, np.ndarray], bool]:
+        state, _, terminated, truncated, info = kitchens[number].step(action)
+        states[number].append(state["observation"])
+        flags[number].append(info)
+        return state, terminated or truncated
+
+    play_together(actor, firsts, step)
+    results = [
+        {
+            "task": task,
+            "episode": number,
+            "success": bool(mine[-1]["success"]),
+            "task_success": any(bool(info["task_success"]) for info in mine),
+            "wrong_tasks": [
+                name
+                for name, done in zip(
+                    KITCHEN_TASKS, mine[-1]["wrong_tasks"], strict=True
                 )
-            finally:
-                kitchen.close()
-            folder.mkdir(parents=True, exist_ok=True)
-            plot_frames(frames, [f"step {int(i) + 1}" for i in shown]).savefig(
-                folder / f"{task}-{number}.png", dpi=150, bbox_inches="tight"
-            )
-    return results
+                if done
+            ],
+            "steps": len(mine),
+        }
+        for number, mine in enumerate(flags)
+    ]
+    return [(r, np.stack(s)) for r, s in zip(results, states, strict=True)]
+
+
+def draw_strip(path: Path, states: np.ndarray) -> None:
+    """Draws six states of an episode, ``[L + 1, 30]``."""
+    shown = np.linspace(0, len(states) - 1, 6).round().astype(int)
+    frames = render(states[shown])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_frames(frames, [f"step {i}" for i in shown]).savefig(
+        path, dpi=150, bbox_inches="tight"
+    )
+
+
+def render(states: np.ndarray) -> np.ndarray:
+    """Returns a frame ``[240, 320, 3]`` of each state ``[30]``."""
+    kitchen = KitchenEnv(render_mode="rgb_array")
+    try:
+        return kitchen.render_states(states)
+    finally:
+        close([kitchen])
+
+
+def close(kitchens: list[KitchenEnv]) -> None:
+    """Closes kitchens, of which each has 60 MB that Python does not know of."""
+    for kitchen in kitchens:
+        kitchen.close()
+    kitchens.clear()
+    gc.collect()
 
 
 def _methods(evaluations: Sequence[Evaluation]) -> list[str]:

@@ -79,6 +79,13 @@ class Method(ABC):
             )
 
     def scoring_options(self, scoring: Scoring) -> dict[str, Any]:
-        """Returns options of ``score_buffer``, by default those of ``env.score``."""
-        options = {key: scoring.settings[key] for key in ("batch_size", "lookahead")}
-        return {**options, "smoothing": scoring.settings.smoothing}
+        """Returns options of ``score_buffer``, by default those of ``env.score``.
+
+        Scores are those of single states: transforms look ahead.
+        """
+        settings = scoring.settings
+        return {
+            "batch_size": settings.batch_size,
+            "smoothing": settings.smoothing,
+            "lookahead": 0,
+        }

@@ -39,6 +39,6 @@ class Oracle(CAIAC):
         """Returns options without smoothing, for some rows only."""
         return {
             "batch_size": self.batch_size,
-            "lookahead": scoring.settings.lookahead,
+            "lookahead": 0,
             "every": self.every,
         }

@@ -4,6 +4,7 @@ import functools
 import importlib
 import json
 
+import numpy as np
 import pytest
 import torch
 
@@ -136,6 +137,107 @@ def test_evaluation(cfg, steps):
     other.env.evaluate.episodes = 1
     with pytest.raises(ValueError, match=r"other settings.*\['episodes'\] differ"):
         steps.evaluate.evaluate(other, "none", seed=0)
+
+
+def test_starts_of_the_splits_and_the_runs_differ(cfg, steps):
+    environment = steps.parts.make_environment(cfg)
+    environment.settings.evaluate.validation_episodes = 3
+    seeds = [
+        seed
+        for run in range(20)
+        for split in ("validation", "test")
+        for seed in environment.start_seeds(run, split)
+    ]
+    assert len(seeds) == len(set(seeds)) == 20 * (3 + 2)
+    environment.settings.evaluate.validation_seed = 1005
+    environment.start_seeds(1, "test")
+    with pytest.raises(ValueError, match=r"1004 to 1005.*raise env.*is 1005"):
+        environment.start_seeds(2, "test")
+
+
+class Hesitant:
+    """Acts from the second step on, to check what is carried from step to step."""
+
+    def __call__(self, tensordict):
+        started = ~tensordict["is_init"] if "is_init" in tensordict else None
+        waited = tensordict.get("waited", started)
+        tensordict["action"] = 0.3 * tensordict["observation"][:, :9] * waited
+        tensordict["next", "waited"] = torch.ones_like(waited)
+        return tensordict
+
+
+def test_episodes_are_those_of_kitchens_that_play_alone(
+    tmp_path, steps, compose, monkeypatch
+):
+    short = functools.partial(KitchenEnv, max_episode_steps=60)
+    monkeypatch.setattr("environments.kitchen.KitchenEnv", short)
+    cfg = compose("env=kitchen_all_tasks")
+    environment = steps.parts.make_environment(cfg)
+    settings = environment.settings.evaluate
+    settings.tasks, settings.validation_episodes = ["kettle", "light_switch"], 2
+    episodes = environment.play(Hesitant(), 1, tmp_path, split="validation")
+    assert [(e["task"], e["episode"]) for e in episodes] == [
+        (task, number) for task in settings.tasks for number in (0, 1)
+    ]
+    for episode in episodes:
+        kitchen = short(episode["task"], start="random")
+        seed = environment.start_seeds(1, "validation")[episode["episode"]]
+        state, _ = kitchen.reset(seed=seed)
+        over, step, done = False, 0, False
+        while not over:
+            action = 0.3 * state["observation"][:9] * (step > 0)
+            state, _, terminated, truncated, info = kitchen.step(action)
+            over, step = terminated or truncated, step + 1
+            done |= bool(info["task_success"])
+        assert (episode["steps"], episode["task_success"]) == (step, done)
+        assert episode["success"] == info["success"]
+        assert episode["wrong_tasks"] == [
+            task
+            for task, wrong in zip(KITCHEN_TASKS, info["wrong_tasks"], strict=True)
+            if wrong
+        ]
+        kitchen.close()
+
+
+def test_episodes_of_different_lengths(steps):
+    playing = importlib.import_module("environments.playing")
+    lengths, seen = [2, 1, 3], []
+
+    class Counting:
+        def __call__(self, tensordict):
+            fresh = torch.zeros(3, 1, dtype=torch.int64)
+            count = tensordict.get("count", fresh) + 1
+            seen.append(tensordict["state"].tolist())
+            tensordict["action"] = count.expand(3, 2)
+            tensordict["next", "count"] = count
+            return tensordict
+
+    taken = [[], [], []]
+
+    def step(number, action):
+        taken[number].append(action.tolist())
+        played = len(taken[number])
+        return {"state": np.array(10 * number + played)}, played == lengths[number]
+
+    states = [{"state": np.array(10 * number)} for number in range(3)]
+    playing.play_together(Counting(), states, step)
+    assert taken == [[[1, 1], [2, 2]], [[1, 1]], [[1, 1], [2, 2], [3, 3]]]
+    assert seen == [[0, 10, 20], [1, 11, 21], [2, 11, 22]]
+    assert [state["state"] for state in states] == [0, 10, 20]
+
+
+def test_measures(environment):
+    flags = [("kettle", 1, 1), ("kettle", 0, 1), ("kettle", 0, 0), ("microwave", 1, 1)]
+    keys = ("task", "success", "task_success")
+    episodes = [dict(zip(keys, flag, strict=True)) for flag in flags]
+    assert [tuple(row.values()) for row in environment.measures(episodes)] == [
+        ("kettle", "success", 3, 1 / 3),
+        ("kettle", "task_success", 3, 2 / 3),
+        ("microwave", "success", 1, 1.0),
+        ("microwave", "task_success", 1, 1.0),
+    ]
+    rows = environment.measures(episodes)
+    assert set(rows[0]) == {"task", "measure", "episodes", "value"}
 
 
 def test_offline_rl_learns_from_the_same_data(cfg, steps, compose):
