@@ -5,20 +5,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 
+from environments.playing import Split
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer
 
-__all__ = ["Environment", "Evaluation", "Split"]
-
-Split = Literal["validation", "test"]
+__all__ = ["Environment", "Evaluation"]
 
 
 class Evaluation(NamedTuple):

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
-from environments.base import Environment, Evaluation, Split, compare_methods
+from environments.base import Environment, Evaluation, compare_methods
+from environments.playing import Split, play_together
 from torchrl_caiac.data import (
     load_minari,
     load_transitions,
@@ -164,6 +164,82 @@ class FetchPush(Environment):
         return DistanceInfluence(LAYOUT, positions, action_only=action_only)
 
     def play(
+        self, actor: Any, seed: int, folder: Path, *, split: Split = "test"
+    ) -> list[dict[str, Any]]:
+        """Plays episodes from the same starts for all runs."""
+        settings = self.settings.evaluate
+        episodes, first = {
+            "test": (settings.episodes, settings.seed),
+            "validation": (settings.validation_episodes, settings.validation_seed),
+        }[split]
+        steps = self.settings.collect.steps
+        return play(actor, episodes=episodes, steps=steps, seed=first, **self.cubes)
+
+    def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Returns the shares of episodes in which both, and each, cube arrived."""
+        return [
+            {
+                "task": "two cubes",
+                "measure": name,
+                "episodes": len(episodes),
+                "value": float(np.mean([episode[name] for episode in episodes])),
+            }
+            for name in MEASURES
+        ]
+
+    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
+        """Returns one line for each policy: the shares of its episodes."""
+        return [{name: _mean(evaluation, name) for name in MEASURES}]
+
+    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
+        """Returns mean success of each run, by the fraction of the data."""
+        return {
+            f"{100 * fraction:g} % of the data": _by_seed(
+                [e for e in evaluations if e.fraction == fraction], "full"
+            )
+            for fraction in dict.fromkeys(e.fraction for e in evaluations)
+        }
+
+    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
+        """Returns success by method, and CAIAC's difference to the others."""
+        steps = sorted({e.step for e in evaluations})
+        lines = [
+            f"success in {self.settings.evaluate.episodes} episodes, mean of the "
+            f"policies from step {steps[0]} to {steps[-1]}, 95 % interval over seeds",
+            f"  {'':<14}" + "".join(f"{name:>22}" for name in MEASURES),
+        ]
+        by_method = _by_method(evaluations)
+        for method, mine in by_method.items():
+            cells = []
+            for measure in MEASURES:
+                values = _by_seed(mine, measure)
+                low, high = bootstrap_interval(values)
+                cells.append(f"{np.mean(values):.3f} [{low:.3f}, {high:.3f}]")
+            lines.append(f"  {method:<14}" + "".join(f"{cell:>22}" for cell in cells))
+        if "caiac" in by_method and len(by_method) > 1:
+            lines += [
+                "",
+                "full success of caiac minus that of, 95 % interval over starts",
+            ]
+            own = _by_start(by_method.pop("caiac"))
+            for method, mine in by_method.items():
+                difference = own - _by_start(mine)
+                low, high = bootstrap_interval(difference)
+                lines.append(
+                    f"  {method:<14}{difference.mean():>+7.3f} [{low:.3f}, {high:.3f}]"
+                )
+        return lines
+
+    def answer(self, evaluations: Sequence[Evaluation]) -> str:
+        """Returns the share of episodes in which both cubes reach their goals."""
+        shares = {
+            method: f"{100 * np.mean(_by_seed(mine, 'full')):.1f} %"
+            for method, mine in _by_method(evaluations).items()
+        }
+        return f"both cubes at their goals: {compare_methods(shares)}"
+
+
+def play(
     actor: Any, *, episodes: int, steps: int, seed: int, **cubes: float
 ) -> list[dict[str, bool]]:
     """Plays episodes in parallel, from the starts that the seed determines.
@@ -176,34 +252,22 @@ class FetchPush(Environment):
     """
     make = partial(FetchPushCubes, 2, max_episode_steps=steps, **cubes)
     envs = [make() for _ in range(episodes)]
-    states = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
-    reached = np.zeros((steps, episodes, 2), dtype=np.bool_)
-    keys = [key for key in actor.in_keys if key in states[0]]
-    # What a policy carries from step to step, for example a plan.
-    carried = TensorDict({"is_init": torch.ones(episodes, 1, dtype=torch.bool)})
-    carried.batch_size = [episodes]
-    running = list(range(episodes))
-    for step in range(steps):
-        inputs = {k: torch.from_numpy(np.stack([s[k] for s in states])) for k in keys}
-        with torch.no_grad():
-            output = actor(TensorDict(inputs, [episodes]).update(carried))
-        actions = output["action"].numpy()
-        carried = output.get("next", TensorDict({}, [episodes]))
-        for i in running:
-            states[i], _, _, _, info = envs[i].step(actions[i])
-            reached[step, i] = info["cube_success"]
-        running = [i for i in running if not reached[step, i].all()]
-        if not running:
-            break
+    reached = np.zeros((episodes, 2), dtype=np.bool_)
+    full = np.zeros(episodes, dtype=np.bool_)
+
+    def step(number: int, action: np.ndarray) -> tuple[dict[str, Any], bool]:
+        state, _, terminated, truncated, info = envs[number].step(action)
+        reached[number] |= info["cube_success"]
+        full[number] = info["cube_success"].all()
+        return state, bool(full[number] or terminated or truncated)
+
+    starts = [env.reset(seed=seed + number)[0] for number, env in enumerate(envs)]
+    play_together(actor, starts, step)
     for env in envs:
         env.close()
     return [
-        {
-            "full": bool(reached[:, i].all(-1).any()),
-            "cube0": bool(reached[:, i, 0].any()),
-            "cube1": bool(reached[:, i, 1].any()),
-        }
-        for i in range(episodes)
+        {"full": bool(all_), "cube0": bool(first), "cube1": bool(second)}
+        for all_, (first, second) in zip(full, reached, strict=True)
     ]
 
 
