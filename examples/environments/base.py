@@ -27,7 +27,8 @@ class Evaluation(NamedTuple):
         method (str): the name of the method.
         seed (int): of the run.
         step (int): gradient steps of the policy.
-        fraction (float): of the data that the run was trained on.
+        split (str): ``"validation"`` or ``"test"``.
+        seconds (float): processor time.
         episodes (list of dict): one dictionary for each episode, as
             :meth:`Environment.play` returns them.
     """
@@ -35,7 +36,8 @@ class Evaluation(NamedTuple):
     method: str
     seed: int
     step: int
-    fraction: float
+    split: Split
+    seconds: float
     episodes: list[dict[str, Any]]
 
 
@@ -143,40 +145,25 @@ class Environment(ABC):
             folder (Path): for figures of episodes, if any.
 
         Keyword Args:
-            split (str): ``"test"``, whose starts are reported, or ``"validation"``, on
-                which choices are made; they have no start in common.
+            split (str): ``"validation"``, from which the best policy of a run is
+                chosen, or ``"test"``, which is reported. They have no start in common.
 
         Returns:
             list of dict: one dictionary for each episode, JSON values.
         """
 
     @abstractmethod
-    def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Summarises the episodes of an evaluation.
+    def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Returns the results of an evaluation.
 
         Args:
-            episodes (sequence of dict): from :meth:`play`.
+            episodes (sequence of dict): as :meth:`play` returns them.
 
         Returns:
-            list of dict: ``"task"``, ``"measure"``, the number of ``"episodes"``, and
-            the mean ``"value"``.
+            list of dict: for each task and measure ``"task"``, ``"measure"``, the
+            number of ``"episodes"``, and their mean ``"value"``. The first measure is
+            that of success.
         """
-
-    @abstractmethod
-    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns the lines of the table of results that belong to one policy."""
-
-    @abstractmethod
-    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Returns the success of a method: groups of independent results."""
-
-    @abstractmethod
-    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Returns the lines that report the success of all methods."""
-
-    @abstractmethod
-    def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the main result of a study in one line."""
 
     def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
         """Draws figures of its own. Defaults to none.
@@ -192,10 +179,3 @@ class Environment(ABC):
             list of str: remarks, for example on figures that were left out.
         """
         return []
-
-
-def compare_methods(shares: Mapping[str, str]) -> str:
-    """Joins the results of methods: ``"0/40 without, 40/40 with counterfactuals"``."""
-    if {"none", "caiac"} <= shares.keys():
-        return f"{shares['none']} without, {shares['caiac']} with counterfactuals"
-    return ", ".join(f"{share} ({name})" for name, share in shares.items())

@@ -54,6 +54,8 @@ class Method(ABC):
     """The world models that are fitted for it."""
     fits_itself: ClassVar[bool] = False
     """Whether :meth:`estimator` fits something that takes time."""
+    env_settings: ClassVar[tuple[str, ...]] = ()
+    """The parts of ``env`` that its scores depend on, besides ``env.score``."""
     score_key: ClassVar[NestedKey | None] = None
     """The leaf of its scores; ``None`` where it needs none."""
 

@@ -25,6 +25,7 @@ class Oracle(CAIAC):
 
     label = "with counterfactuals (ground truth)"
     models = ()
+    env_settings = ("truth",)
     score_key = ("oracle", "score")
     threshold: float = 0.5
     num_actions: int = 16
