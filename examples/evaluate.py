@@ -1,19 +1,24 @@
 """Evaluates the saved policies of a run.
 
-Run after ``train.py``: ``python evaluate.py method=caiac seed=0``.
+Run after ``train.py``: ``python evaluate.py method=caiac seed=0``. Every policy that was
+kept plays from validation starts. The best one plays from the test starts, whose
+results are those of the run.
 """
 
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Iterator
 from typing import Any
 
 import hydra
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from environments.base import Evaluation
+from environments.base import Evaluation, Split
 from shared.console import progress_bar, start
-from shared.parts import make_environment, policy_file, policy_steps, run_folder
+from shared.parts import candidates, make_environment, policy_file, run_folder
 from shared.settings import keep_settings
 from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.data.digests import file_digest
@@ -22,45 +27,60 @@ from train import check_run, load_policy
 _LOGGER = logging.getLogger(__name__)
 
 
-def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
-    """Evaluates the saved policies of one run.
+def evaluate(cfg: DictConfig, method: str, seed: int) -> Iterator[Evaluation]:
+    """Evaluates the policies of a run: all on validation starts, then the best one.
 
-    The results are saved in ``evaluation/<step>.json``; existing ones are not repeated.
-    They are refused if the run, or the policy, is another one by now.
+    A run with one policy has nothing to choose, and is not validated. Of policies that
+    are equally good, the last one counts.
+
+    The results are saved in ``<evaluations>/<split>-<step>.json``; existing ones are not
+    repeated. They are refused if the run, or the policy, is another one by now.
+
+    Yields:
+        Evaluation: the last one has the split ``"test"``.
     """
+    key, steps = make_environment(cfg).success_key, candidates(cfg)
+    best, success = steps[-1], -1.0
+    if len(steps) > 1:
+        name = run_folder(cfg, method, seed).name
+        with progress_bar(total=len(steps), desc=f"{name} plays", unit="policy") as bar:
+            for step in steps:
+                evaluation = play(cfg, method, seed, step, "validation")
+                share = float(np.mean([e[key] for e in evaluation.episodes]))
+                if share >= success:
+                    best, success = step, share
+                bar.update()
+                yield evaluation
+    yield play(cfg, method, seed, best, "test")
+
+
+def play(
+    cfg: DictConfig, method: str, seed: int, step: int, split: Split
+) -> Evaluation:
+    """Returns the episodes of a policy, which are played if they have not been."""
     environment = make_environment(cfg)
-    folder = run_folder(cfg, method, seed) / "evaluation"
+    folder = run_folder(cfg, method, seed) / cfg.evaluations
     kept: dict[str, Any] = OmegaConf.to_container(cfg.env.evaluate)
-    for name in ("last", "curve_every"):  # which policies, not what they do
-        kept.pop(name)
     kept["collect"] = OmegaConf.to_container(cfg.env.collect)  # has lengths of episodes
     keep_settings(folder, "evaluate", kept)
     check_run(cfg, method, seed)
-    evaluations = []
-    steps = policy_steps(cfg)
-    bar = progress_bar(
-        total=len(steps), desc=f"{folder.parent.name} plays", unit="policy"
-    )
-    with bar:
-        for step in steps:
-            path = folder / f"{step}.json"
-            policy = policy_file(cfg, method, seed, step)
-            if policy.exists():
-                played = {"sha256": file_digest(policy)}
-                keep_settings(folder, f"policy-{step}", played)
-            if not path.exists():
-                actor = load_policy(cfg, method, seed, step)
-                write_json(path, environment.play(actor, seed, folder))
-            fraction = float(cfg.env.get("fraction", 1.0))
-            remedy = "delete it, to play the episodes again"
-            episodes = read_json(path, "evaluation", remedy)
-            evaluations.append(Evaluation(method, seed, step, fraction, episodes))
-            bar.update()
-    success = [episode[environment.success_key] for episode in evaluations[-1].episodes]
+    path = folder / f"{split}-{step}.json"
+    policy = policy_file(cfg, method, seed, step)
+    if policy.exists():
+        keep_settings(folder, f"policy-{step}", {"sha256": file_digest(policy)})
+    if not path.exists():
+        actor = load_policy(cfg, method, seed, step)
+        begin = time.process_time()
+        episodes = environment.play(actor, seed, folder, split=split)
+        seconds = time.process_time() - begin
+        write_json(path, {"seconds": seconds, "episodes": episodes})
+    found = read_json(path, "evaluation", "delete it, to play the episodes again")
+    success = [episode[environment.success_key] for episode in found["episodes"]]
     _LOGGER.info(
-        "%s: %d of %d episodes succeed", folder.parent.name, sum(success), len(success)
+        "%s, step %d: %d of %d %s episodes succeed",
+        *(folder.parent.name, step, sum(success), len(success), split),
     )
-    return evaluations
+    return Evaluation(method, seed, step, split, found["seconds"], found["episodes"])
 
 
 @hydra.main(version_base=None, config_path="conf", config_name="config")
@@ -70,9 +90,12 @@ def main(cfg: DictConfig) -> None:
         folder = run_folder(cfg, method, cfg.seed)
         with start(cfg, folder=folder) as console:
             with console.stage(f"{folder.name} plays"):
-                evaluations = evaluate(cfg, method, cfg.seed)
-            for line in make_environment(cfg).table(evaluations[-1:]):
-                console.print(line)
+                *_, best = evaluate(cfg, method, cfg.seed)
+            for row in make_environment(cfg).measures(best.episodes):
+                console.print(
+                    f"{method}, step {best.step}, {row['task']}, {row['measure']}: "
+                    f"{row['value']:.3f} of {row['episodes']} episodes"
+                )
 
 
 if __name__ == "__main__":

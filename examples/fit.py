@@ -123,9 +123,9 @@ def fit_seconds(cfg: DictConfig, name: str) -> float:
 
 
 def fit(cfg: DictConfig) -> None:
-    """Fits the models that the methods need, and the Gaussian one, which is checked."""
+    """Fits the models that the methods need."""
     methods = make_methods(cfg).values()
-    needed = {"world_model", *(name for method in methods for name in method.models)}
+    needed = {name for method in methods for name in method.models}
     for name in MAKERS:
         if name in needed:
             fit_model(cfg, name)

@@ -19,7 +19,7 @@ from fit import fit_model
 from methods.base import Scoring
 from methods.caiac import CAIAC
 from shared.console import progress, start
-from shared.parts import make_environment, make_methods
+from shared.parts import make_environment, make_learner, make_methods
 from shared.settings import keep_settings
 from torchrl_caiac._files import whole_file, write_json
 from torchrl_caiac.data import offline_buffer
@@ -37,33 +37,43 @@ def make_scoring(cfg: DictConfig) -> Scoring:
 
 
 def score(cfg: DictConfig) -> dict[str, Any]:
-    """Scores the rows for all methods, and checks CAI on held-out rows.
+    """Scores what the learner trains on, and checks CAI on held-out rows.
 
     Returns:
         dict: the report of unsmoothed scores, and of those smoothed as they are used,
-        also written to ``influence.json``.
+        also written to ``influence.json``; empty without the method ``caiac``.
     """
     scoring = make_scoring(cfg)
+    environment = scoring.environment
+    kept: dict[str, Any] = OmegaConf.to_container(scoring.settings)
+    kept.pop("batch_size")  # changes no result
+    kept |= {
+        "layout": environment.layout.to_dict(),
+        "data": content_digests(environment.rows()),
+    }
+    keep_settings(environment.folder, "score", kept)
+    methods = make_methods(cfg)
+    keys = {str(method.score_key): name for name, method in methods.items()}
+    for name in keys.values():  # methods with the same scores are scored once
+        rows = make_learner(cfg, name).stored_rows()
+        methods[name].score(offline_buffer(rows, batch_size=1), scoring)
+    return check_scores(cfg, scoring) if "caiac" in methods else {}
+
+
+def check_scores(cfg: DictConfig, scoring: Scoring) -> dict[str, Any]:
+    """Compares CAI's scores of held-out rows with the ground truth."""
     environment, settings = scoring.environment, scoring.settings
-    for step, values, rows in (
-        ("score", settings, environment.rows()),
-        ("truth", cfg.env.truth, environment.held_out()),
-    ):
-        kept: dict[str, Any] = OmegaConf.to_container(values)
-        kept.pop("batch_size")  # changes no result
-        kept |= {
-            "layout": environment.layout.to_dict(),
-            "data": content_digests(rows),
-        }
-        keep_settings(environment.folder, step, kept)
-    rb = offline_buffer(environment.rows(), batch_size=1)
-    methods = {str(method.score_key): method for method in make_methods(cfg).values()}
-    for method in methods.values():
-        method.score(rb, scoring)
+    kept: dict[str, Any] = OmegaConf.to_container(cfg.env.truth)
+    kept.pop("batch_size")
+    kept |= {
+        "layout": environment.layout.to_dict(),
+        "data": content_digests(environment.held_out()),
+    }
+    keep_settings(environment.folder, "truth", kept)
     threshold = cfg.env.augmentation.threshold
     estimator = CAIAC(threshold).estimator(scoring)
     truth = environment.ground_truth(progress=scoring.progress)
-    # A copy: the scores of other fractions' models are of the same rows.
+    # A copy: the scores of other numbers of demonstrations are of the same rows.
     rb = offline_buffer(environment.held_out().clone(), batch_size=1)
     report: dict[str, Any] = {}
     for smoothing in sorted({1, settings.smoothing}):

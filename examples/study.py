@@ -1,288 +1,366 @@
-"""Runs all steps for several methods and seeds, from an empty folder, and reports.
+"""Runs all missing runs of a study, and reports its results.
 
-``python study.py study=demo`` is the motivating experiment in the kitchen,
-``study=fetch_push`` offline reinforcement learning; ``size=quick`` makes either a smoke
-run. Finished steps are skipped, interrupted ones resume.
+``python study.py study=demo`` is the motivating experiment in the kitchen. A study is
+one file in ``conf/study/``; ``size=quick`` makes any of them a smoke run. Without
+``study=``, the study is that of one configuration, such as ``env=fetch_push learner=bc
+'method=[none,caiac]' seeds=[0,1]``.
+
+Finished runs are those whose test is in the table of results, ``<publish>/<name>.csv``;
+they are not repeated. Interrupted ones resume. Several processes may run a study at the
+same time: they share the preparation and the runs.
+
+Further arguments:
+
+- ``settings``, ``learners``, ``methods``, ``seeds``: only these runs, such as
+  ``seeds=[0,1]``
+- ``processes``: runs at the same time, 2 by default; 0 for this process
+- ``root``: the folder of all outputs instead of ``outputs``
+- ``publish``: the folder of the results
+- ``stale=recompute``: results that were made with other settings than the study has
+  now are removed and computed again; otherwise they are refused
+- everything else is an override for Hydra, of all runs
 """
 
 from __future__ import annotations
 
-import csv
-import math
-import shutil
+import logging
+import subprocess
+import sys
 import time
-from collections.abc import Sequence
-from itertools import product
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import hydra
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
 from collect import collect
-from environments.base import Evaluation
 from evaluate import evaluate
+from figures import answer_study, draw_study, report_study
 from fit import fit
 from score import score
-from shared.console import Console, log_in_process, start
-from shared.parts import (
-    last_policies,
-    make_environment,
-    make_learner,
-    make_methods,
-    policy_steps,
-    run_folder,
-)
-from torchrl_caiac._files import claim_folder, whole_file, write_json
+from shared.console import Console, log_in_process
+from shared.parts import make_environment, run_folder
+from shared.results import add_rows, read_rows, remove_runs, state_of, unlisted
+from shared.studies import Run, Study, ad_hoc_study, digest, load_study, run_settings
+from torchrl_caiac._files import claim_folder, write_json
 from torchrl_caiac._processes import run_in_processes
-from torchrl_caiac.plotting import plot_learning_curves, plot_success
-from train import train
+from train import train, train_seconds
 
-_SWAP_BATCHES = 50  # batches from which the share of swaps is taken
-
-
-def run(
-    cfg: DictConfig, method: str, seed: int
-) -> tuple[list[Evaluation], float, float]:
-    """Trains and evaluates one method with one seed, and times both in seconds."""
-    log_in_process()
-    with claim_folder(run_folder(cfg, method, seed)):
-        begin = time.perf_counter()
-        train(cfg, method, seed)
-        trained = time.perf_counter()
-        evaluations = evaluate(cfg, method, seed)
-    return evaluations, trained - begin, time.perf_counter() - trained
+_LOGGER = logging.getLogger(__name__)
+_SECONDS_BETWEEN_TRIES = 2.0
 
 
-def share_swapped(cfg: DictConfig, method: str) -> float:
-    """Returns the share of sampled rows in which an entity is swapped."""
-    learner = make_learner(cfg, method)
-    rb = learner.make_buffer(learner.rows())
-    torch.manual_seed(0)
-    swapped = [rb.sample()["caiac", "swapped"].any(-1) for _ in range(_SWAP_BATCHES)]
-    return torch.stack(swapped).float().mean().item()
+@dataclass(frozen=True)
+class Options:
+    """The arguments of this script.
+
+    Attributes:
+        study (Study): with the overrides of the arguments.
+        root (Path): the folder of all outputs.
+        publish (Path): the folder of the results.
+        processes (int): runs at the same time.
+        only (dict): the runs that are wanted: ``settings``, ``learners``, ``methods``
+            and ``seeds``, each a list of strings. Missing ones mean all.
+        stale (str): ``"refuse"`` or ``"recompute"``.
+    """
+
+    study: Study
+    root: Path
+    publish: Path
+    processes: int
+    only: dict[str, list[str]]
+    stale: Literal["refuse", "recompute"]
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the study's log and figures."""
+        size = "_quick" if "size=quick" in self.study.overrides else ""
+        return self.root / "studies" / f"{self.study.name}{size}"
+
+    @property
+    def table(self) -> Path:
+        """The table of results."""
+        return self.publish / f"{self.study.name}.csv"
+
+    def wanted(self, run: Run) -> bool:
+        """Returns whether a run was asked for."""
+        return all(
+            str(value) in self.only[name]
+            for name, value in zip(_FILTERS, run.key, strict=True)
+            if name in self.only
+        )
 
 
-def result_rows(
-    cfg: DictConfig, evaluations: Sequence[Evaluation]
-) -> list[dict[str, Any]]:
-    """Returns the table of results, one or several rows per policy."""
-    environment = make_environment(cfg)
-    return [
-        {
-            "fraction": evaluation.fraction,
-            "method": evaluation.method,
-            "seed": evaluation.seed,
-            "step": evaluation.step,
-            **row,
-        }
-        for evaluation in evaluations
-        for row in environment.results(evaluation)
-    ]
+_FILTERS = ("settings", "learners", "methods", "seeds")
 
 
-def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Writes the table of results."""
-    with whole_file(path) as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+def read_arguments(arguments: Sequence[str]) -> Options:
+    """Returns the arguments of the script.
 
-
-def influence_table(cfg: DictConfig, report: dict[str, Any]) -> list[str]:
-    """Reports how well the scores find what the action moves, on unseen data."""
-    lines = [
-        "influence on unseen data",
-        f"  {'':<22}{'AUC':>7}{'influenced':>12}{'score <= θ':>12}"
-        f"{'true positive':>15}{'false positive':>16}{'best θ':>9}",
-    ]
-    fixed = make_environment(cfg).layout.fixed
-    for smoothing, entities in report.items():
-        if len(report) > 1:
-            lines.append(f"  {smoothing}")
-        for name, row in entities.items():
-            if name in fixed:
-                continue
-            rates = ("true_positive_rate", "false_positive_rate")
-            cells = [
-                _number(row["auc"], ".3f"),
-                *(_number(row[k], ".1%") for k in ("influenced", "below_threshold")),
-                *(_number(row[k], ".1%") for k in rates),
-                _number(row["best_threshold"], ".3f"),
-            ]
-            widths = (7, 12, 12, 15, 16, 9)
-            lines.append(
-                f"  {name:<22}"
-                + "".join(f"{cell:>{n}}" for cell, n in zip(cells, widths, strict=True))
+    Raises:
+        ValueError: an argument is not known, or has a wrong value.
+        FileNotFoundError: there is no such study.
+    """
+    own: dict[str, Any] = {}
+    overrides: list[str] = []
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if not equals:
+            raise ValueError(f"the argument {argument!r} has no value: name=value")
+        if name in (*_FILTERS, "study", "processes", "root", "publish", "stale"):
+            own[name] = OmegaConf.to_container(OmegaConf.from_dotlist([argument]))[name]
+        else:
+            overrides.append(argument)
+    only = {
+        name: [str(v) for v in (own[name] if isinstance(own[name], list) else [own[name]])]
+        for name in _FILTERS
+        if name in own
+    }
+    processes, stale = own.get("processes", 2), own.get("stale", "refuse")
+    if type(processes) is not int or processes < 0:
+        raise ValueError(f"processes is {processes!r}, expected an integer from 0")
+    if stale not in ("refuse", "recompute"):
+        raise ValueError(f"stale is {stale!r}, expected refuse or recompute")
+    quick = "size=quick" in overrides
+    if own.get("study") is None:
+        study = ad_hoc_study(overrides, list(map(int, only.pop("seeds", []))))
+        if quick:
+            study = study.quick()
+    else:
+        study = load_study(str(own["study"]))
+        if chosen := [o for o in overrides if "." not in o.partition("=")[0]]:
+            if chosen != ["size=quick"] and any(
+                o.partition("=")[0] in ("env", "learner", "method") for o in chosen
+            ):
+                raise ValueError(
+                    f"{chosen} with study={study.name}: the study chooses them, leave "
+                    "them out, or choose runs by settings=, learners= and methods="
+                )
+        if quick:
+            study = study.quick()
+            overrides.remove("size=quick")
+        if overrides:  # not the results of the study as it is published
+            study = replace(
+                study, overrides=(*study.overrides, *overrides), publish=None
             )
-    return lines
+    root = Path(str(own.get("root", "outputs")))
+    study = replace(study, overrides=(*study.overrides, f"root={root}"))
+    options = Options(study, root, Path(), processes, only, stale)
+    publish = own.get("publish") or study.publish or options.folder
+    return replace(options, publish=Path(str(publish)))
 
 
-def _number(value: float, form: str) -> str:
-    # NaN where nothing, or everything, is influenced.
-    return "-" if math.isnan(value) else f"{value:{form}}"
+def prepare(cfg: DictConfig, console: Console | None = None) -> None:
+    """Collects, fits and scores what the runs of a configuration need, once.
+
+    Args:
+        cfg (DictConfig): the configuration, with all methods of its runs.
+        console (Console, optional): for the stages. Defaults to ``None``: none.
+    """
+    log_in_process()
+    stage = nullcontext if console is None else console.stage
+    environment = make_environment(cfg)
+    marker = _preparation(cfg)
+    done = environment.folder / "prepared" / f"{digest(marker)}.json"
+    with claim_when_free(environment.out), stage(environment.data_name):
+        if not done.exists():
+            collect(cfg)
+            # Here, since several folders may share the held-out rows.
+            environment.ground_truth()
+    with claim_when_free(environment.folder):
+        with stage("world model"):
+            if not done.exists():
+                fit(cfg)
+        with stage("scores"):
+            if not done.exists():
+                score(cfg)
+                write_json(done, marker)
 
 
-def report_table(
-    cfg: DictConfig,
-    influence: dict[str, Any],
-    swapped: dict[str, float],
-    evaluations: Sequence[Evaluation],
-) -> str:
-    """Returns the table of one fraction of the data."""
-    lines = []
-    if "fraction" in cfg.env:
-        lines += [f"{100 * cfg.env.fraction:g} % of the data", ""]
-    lines += [*influence_table(cfg, influence), ""]
-    if swapped:
-        shares = ", ".join(f"{name} {share:.1%}" for name, share in swapped.items())
-        ratio = cfg.env.augmentation.counterfactual_ratio
-        lines += [
-            f"rows with a swap: {shares} (counterfactual: {ratio:.0%})",
-            "",
-        ]
-    steps = last_policies(cfg)
-    lines += make_environment(cfg).table([e for e in evaluations if e.step in steps])
-    return "\n".join(lines) + "\n"
+def _preparation(cfg: DictConfig) -> dict[str, Any]:
+    """Returns what the preparation depends on."""
+    env: dict[str, Any] = OmegaConf.to_container(cfg.env, resolve=True)
+    for name in ("evaluate", "augmentation"):
+        env.pop(name)
+    methods = OmegaConf.to_container(cfg.method, resolve=True)
+    return {"env": env, "methods": methods}
 
 
-def method_labels(cfg: DictConfig) -> dict[str, str]:
-    """Returns the names of the methods in figures."""
-    # A method that extends another one does not take over its label.
-    labels = {
-        name: vars(type(method)).get("label", "")
-        for name, method in make_methods(cfg).items()
-    }
-    return {name: label for name, label in labels.items() if label}
+@contextmanager
+def claim_when_free(folder: Path) -> Iterator[None]:
+    """Locks a folder; waits while another process has it."""
+    with ExitStack() as stack:
+        told = False
+        while True:
+            try:
+                stack.enter_context(claim_folder(folder))
+                break
+            except RuntimeError as error:
+                if not told:
+                    _LOGGER.info("waiting: %s", error)
+                    told = True
+                time.sleep(_SECONDS_BETWEEN_TRIES)
+        yield
 
 
-def draw_curves(cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path) -> None:
-    """Draws success along training, of the policies that were evaluated."""
-    steps, key = policy_steps(cfg), make_environment(cfg).success_key
-    success = {
-        (e.method, e.seed, e.step): float(np.mean([p[key] for p in e.episodes]))
-        for e in evaluations
-    }
-    curves = {
-        method: (
-            steps,
-            [[success[method, s, step] for step in steps] for s in cfg.study.seeds],
+def run(job: Run, table: Path, commit: str) -> str:
+    """Trains and evaluates one run, and adds its results to the table.
+
+    Returns:
+        str: ``"done"``; ``"busy"`` if another process has the run; or an error.
+    """
+    log_in_process()
+    cfg, method, seed = job.cfg, job.method, job.seed
+    folder = run_folder(cfg, method, seed)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(claim_folder(folder))
+        except RuntimeError:
+            return "busy"
+        if state_of(job, read_rows(table)) == "done":  # by another process, meanwhile
+            return "done"
+        try:
+            write_json(folder / "settings.json", run_settings(cfg, method))
+            train(cfg, method, seed)
+            environment, seconds = make_environment(cfg), train_seconds(folder)
+            for evaluation in evaluate(cfg, method, seed):
+                common = {
+                    "setting": job.setting,
+                    "learner": job.learner,
+                    "method": method,
+                    "seed": seed,
+                    "step": evaluation.step,
+                    "split": evaluation.split,
+                    "train_seconds": round(seconds, 1),
+                    "evaluate_seconds": round(evaluation.seconds, 1),
+                    "commit": commit,
+                    "settings": job.digest,
+                }
+                measures = environment.measures(evaluation.episodes)
+                add_rows(table, [{**common, **row} for row in measures])
+        except Exception as error:  # the other runs go on
+            _LOGGER.exception("%s failed", job)
+            return f"{job}: {type(error).__name__}: {error}"
+    return "done"
+
+
+def git_commit() -> str:
+    """Returns the commit of this code, with ``+`` if files differ from it."""
+    here = Path(__file__).parent
+    try:
+        name, changed = (
+            subprocess.run(
+                ["git", *command], cwd=here, capture_output=True, text=True, check=True
+            ).stdout.strip()
+            for command in (
+                ("rev-parse", "--short", "HEAD"),
+                ("status", "--porcelain", "-uno", "--", ".", "../torchrl_caiac"),
+            )
         )
-        for method in cfg.method
-    }
-    title = cfg.study.title
-    if "fraction" in cfg.env:
-        title = f"{title}, {100 * cfg.env.fraction:g} % of the data"
-    figure = plot_learning_curves(curves, labels=method_labels(cfg), title=title)
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=150)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return name + ("+" if changed else "")
 
 
-def draw_success(
-    cfg: DictConfig, evaluations: Sequence[Evaluation], path: Path
-) -> None:
-    """Draws the success of all methods."""
-    environment, steps = make_environment(cfg), last_policies(cfg)
-    bars = {
-        method: environment.bars(
-            [e for e in evaluations if e.method == method and e.step in steps]
+def missing_runs(options: Options, runs: Sequence[Run]) -> list[Run]:
+    """Returns the wanted runs that the table lacks, with room made for them.
+
+    Raises:
+        ValueError: the table has results of other settings, or of runs that the study
+            does not have.
+    """
+    rows = read_rows(options.table)
+    states = {run.key: state_of(run, rows) for run in runs}
+    stale = [run.key for run in runs if states[run.key] == "stale"]
+    stale += unlisted(runs, rows)
+    if stale and options.stale == "refuse":
+        listed = "; ".join(map(", ".join, stale[:3])) + ("; ..." if stale[3:] else "")
+        raise ValueError(
+            f"{options.table} has results of {len(stale)} runs that the study "
+            f"{options.study.name} does not have, or has with other settings now "
+            f"({listed}): undo the change of the settings, or give stale=recompute to "
+            "remove these results"
         )
-        for method in cfg.method
-    }
-    figure = plot_success(bars, labels=method_labels(cfg), title=cfg.study.title)
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=150)
+    if stale:
+        remove_runs(options.table, stale)
+    return [run for run in runs if states[run.key] != "done" and options.wanted(run)]
 
 
-def parts_of(cfg: DictConfig) -> list[DictConfig]:
-    """Returns the configurations of all fractions of the data."""
-    if cfg.study.fractions is None:
-        return [cfg]
-    return [
-        OmegaConf.merge(cfg, {"env": {"fraction": float(fraction)}})
-        for fraction in cfg.study.fractions
-    ]
+def preparations(runs: Sequence[Run]) -> list[DictConfig]:
+    """Returns the configurations that runs need prepared, with all of their methods."""
+    by_data: dict[str, DictConfig] = {}
+    for run in runs:
+        env = _preparation(run.cfg)["env"]
+        found = by_data.setdefault(digest(env), run.cfg.copy())
+        found.method = OmegaConf.merge(found.method, run.cfg.method)
+    return list(by_data.values())
 
 
-def run_study(cfg: DictConfig, console: Console) -> None:
-    """Runs all steps, writes the results and figures, and prints them."""
-    out, name, parts = Path(cfg.out), cfg.study.name, parts_of(cfg)
-    figures = out / "figures"
-    figures.mkdir(exist_ok=True)
-    with console.stage(make_environment(cfg).data_name):
-        for part in parts:
-            collect(part)
-    with console.stage("world model"):
-        for part in parts:
-            fit(part)
-    with console.stage("scores"):
-        influence = [score(part) for part in parts]
-    # All methods of a seed before the next one, so that they can be compared early.
-    jobs = list(product(parts, cfg.method, cfg.study.seeds))
-    jobs.sort(key=lambda job: (job[2], parts.index(job[0])))
-    finished: dict[int, tuple[list[Evaluation], float, float]] = {}
-    evaluations: list[Evaluation] = []
-    with console.stage(f"training and evaluation, {len(jobs)} runs"):
-        for number, result in run_in_processes(
-            run, jobs, processes=cfg.study.processes
-        ):
-            finished[number] = result
-            evaluations = [e for n in sorted(finished) for e in finished[n][0]]
-            write_csv(out / f"{name}.csv", result_rows(cfg, evaluations))
-    remarks, tables = [], []
+def run_study(options: Options, console: Console) -> None:
+    """Does what is missing, writes the results and figures, and prints them."""
+    study = options.study
+    runs = study.runs()
+    missing = missing_runs(options, runs)
+    needed = preparations(missing)
+    console.stages = {0: 1, 1: 5}.get(len(needed), 3)
+    if len(needed) == 1:
+        prepare(needed[0], console)
+    elif needed:
+        with console.stage(f"preparation of {len(needed)} settings"):
+            jobs = [(cfg,) for cfg in needed]
+            for _ in run_in_processes(prepare, jobs, processes=options.processes):
+                pass
+    ended: Counter[str] = Counter()
+    if missing:
+        commit = git_commit()
+        jobs = [(job, options.table, commit) for job in missing]
+        with console.stage(f"training and evaluation, {len(jobs)} runs"):
+            for _, how in run_in_processes(run, jobs, processes=options.processes):
+                ended[how] += 1
     with console.stage("figures"):
-        files = [figures / f"{name}_success.png"]
-        draw_success(cfg, evaluations, files[0])
-        for part, report in zip(parts, influence, strict=True):
-            fraction = float(part.env.get("fraction", 1.0))
-            mine = [e for e in evaluations if e.fraction == fraction]
-            if len(policy_steps(part)) > 1:
-                files.append(figures / f"{name}_curves_{fraction:g}.png")
-                draw_curves(part, mine, files[-1])
-            swapped = {
-                method: share_swapped(part, method)
-                for method, parts_ in make_methods(part).items()
-                if parts_.score_key is not None
-            }
-            tables.append(report_table(part, report, swapped, mine))
-        environment = make_environment(cfg)
-        threshold = cfg.env.augmentation.threshold
-        remarks += environment.draw(figures, name, threshold=threshold)
-    with whole_file(out / f"{name}.txt") as partial:
-        partial.write_text("\n".join(tables))
-    seconds = {
-        **console.seconds,
-        "training, a run": np.mean([run[1] for run in finished.values()]).item(),
-        "evaluation, a run": np.mean([run[2] for run in finished.values()]).item(),
-    }
-    write_json(
-        out / f"{name}.json",
-        {
-            "influence": influence[0],
-            "results": result_rows(cfg, evaluations),
-            "seconds": seconds,
-        },
+        lines = report_study(study, runs, options.publish)
+        files = draw_study(study, runs, options.publish)
+    remarks = draw_environment(options, needed)
+    console.print("")
+    for line in (*lines, *remarks):
+        console.print(line)
+    if busy := ended.pop("busy", 0):
+        console.print(f"{busy} runs belong to another process, which is still running")
+    ended.pop("done", None)
+    console.print(f"results: {options.table}; figures: {', '.join(map(str, files))}")
+    if ended:
+        raise RuntimeError(
+            f"{len(ended)} runs failed, see {console.log}; run again to resume. The "
+            f"first one: {next(iter(ended))}"
+        )
+    console.print(answer_study(study, runs, options.publish))
+
+
+def draw_environment(options: Options, prepared: Sequence[DictConfig]) -> list[str]:
+    """Draws the environment's own figures, if it is only one; returns remarks."""
+    if len(prepared) != 1:
+        return []
+    (cfg,) = prepared
+    options.folder.mkdir(parents=True, exist_ok=True)
+    return make_environment(cfg).draw(
+        options.folder, options.study.name, threshold=cfg.env.augmentation.threshold
     )
-    if cfg.study.publish is not None:
-        for file in (*(out / f"{name}.{kind}" for kind in ("csv", "txt")), *files):
-            with whole_file(Path(cfg.study.publish) / file.name) as partial:
-                shutil.copyfile(file, partial)
-    console.print("\n" + "\n".join(tables))
-    for remark in remarks:
-        console.print(remark)
-    console.print(f"results: {out / name}.txt, .csv, .json; figures: {figures}")
-    last = set(last_policies(cfg))
-    console.print(environment.answer([e for e in evaluations if e.step in last]))
 
 
-@hydra.main(version_base=None, config_path="conf", config_name="config")
-def main(cfg: DictConfig) -> None:
-    """Runs the study."""
-    with start(cfg, stages=5) as console:
-        run_study(cfg, console)
+def main(arguments: Sequence[str]) -> None:
+    """Runs the study of the arguments."""
+    options = read_arguments(arguments)
+    torch.set_num_threads(1)
+    with Console(options.folder) as console:
+        run_study(options, console)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main(sys.argv[1:])
+    except (ValueError, FileNotFoundError, RuntimeError) as error:
+        sys.exit(f"error: {error}")

@@ -8,6 +8,8 @@ ends with the same weights as one that was not interrupted.
 from __future__ import annotations
 
 import logging
+import time
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -19,7 +21,7 @@ from shared.console import progress_bar, start
 from shared.log import ScalarLog
 from shared.parts import make_learner, policy_file, run_folder
 from shared.settings import check_settings, keep_settings
-from torchrl_caiac._files import whole_file
+from torchrl_caiac._files import read_json, whole_file, write_json
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 
 _LOGGER = logging.getLogger(__name__)
@@ -41,6 +43,7 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
     log.resume(step)
     if step:
         _LOGGER.info("%s resumes at step %d", folder.name, step)
+    before, begin = train_seconds(folder) if step else 0.0, time.process_time()
     batches = learner.batches()
     bar = progress_bar(
         total=settings.steps, initial=step, desc=folder.name, unit="step"
@@ -59,10 +62,20 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
                     torch.save(learner.policy_state(), partial)
             if step % settings.checkpoint_every == 0 or step == settings.steps:
                 checkpoint.save(step)
+                seconds = before + time.process_time() - begin
+                write_json(folder / "seconds.json", {"seconds": seconds})
     finally:
         torch.set_flush_denormal(False)
         bar.close()
     return learner
+
+
+def train_seconds(folder: Path) -> float:
+    """Returns the processor time that the training of a run has taken so far."""
+    path = folder / "seconds.json"
+    if not path.exists():  # killed right after its first checkpoint
+        return 0.0
+    return float(read_json(path, "time of a training", "delete it")["seconds"])
 
 
 def check_run(cfg: DictConfig, method: str, seed: int) -> None:

@@ -34,6 +34,7 @@ __all__ = [
     "packed_weight",
     "priority_weight",
     "reduce_loss",
+    "sampled_rows",
     "sampling_buffer",
     "storage_data",
     "storage_revision",
@@ -222,12 +223,36 @@ def sampling_buffer() -> ReplayBuffer | None:
 
     A buffer does not make itself known to its transforms.
     """
+    found = sampled_rows()
+    return None if found is None else found[0]
+
+
+def sampled_rows() -> tuple[ReplayBuffer, Any] | None:
+    """Returns the buffer that is sampling in this thread, and the rows that it drew.
+
+    Returns:
+        tuple, optional: the buffer, and the index into its storage, integer ``[B]`` or
+        the coordinates in each dimension; ``None`` if no buffer is sampling.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> from torchrl_caiac._torchrl import sampled_rows
+        >>> found = []
+        >>> rb = ReplayBuffer(storage=LazyTensorStorage(4), batch_size=2)
+        >>> _ = rb.extend(torch.arange(4))
+        >>> _ = rb.append_transform(lambda td: found.append(sampled_rows()) or td)
+        >>> batch = rb.sample()
+        >>> found[0][0] is rb, torch.equal(found[0][1], batch)
+        (True, True)
+    """
     frame = sys._getframe(1)
     while frame is not None:
         if frame.f_code.co_name == "_sample":
-            buffer = frame.f_locals.get("self")
+            variables = frame.f_locals
+            buffer = variables.get("self")
             if isinstance(buffer, ReplayBuffer):
-                return buffer
+                return buffer, variables.get("index")
         frame = frame.f_back  # type: ignore[assignment]
     return None
 

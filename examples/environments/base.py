@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 
+from environments.playing import Split
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer
@@ -26,7 +27,8 @@ class Evaluation(NamedTuple):
         method (str): the name of the method.
         seed (int): of the run.
         step (int): gradient steps of the policy.
-        fraction (float): of the data that the run was trained on.
+        split (str): ``"validation"`` or ``"test"``.
+        seconds (float): processor time.
         episodes (list of dict): one dictionary for each episode, as
             :meth:`Environment.play` returns them.
     """
@@ -34,7 +36,8 @@ class Evaluation(NamedTuple):
     method: str
     seed: int
     step: int
-    fraction: float
+    split: Split
+    seconds: float
     episodes: list[dict[str, Any]]
 
 
@@ -95,8 +98,11 @@ class Environment(ABC):
         return self.rows()
 
     def demonstrations(self) -> TensorDictBase:
-        """Returns the transitions that imitation learners train on."""
-        return self.goal_rows()
+        """Returns the transitions that imitation learners copy, memory-mapped.
+
+        Methods score them. Defaults to :meth:`rows`.
+        """
+        return self.rows()
 
     def model_rows(self) -> list[TensorDictBase]:
         """Returns the datasets that world models are fitted to."""
@@ -128,7 +134,9 @@ class Environment(ABC):
         return held_out["oracle", "score"] > 0.5
 
     @abstractmethod
-    def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
+    def play(
+        self, actor: Any, seed: int, folder: Path, *, split: Split = "test"
+    ) -> list[dict[str, Any]]:
         """Plays the episodes of an evaluation.
 
         Args:
@@ -136,25 +144,26 @@ class Environment(ABC):
             seed (int): of the run.
             folder (Path): for figures of episodes, if any.
 
+        Keyword Args:
+            split (str): ``"validation"``, from which the best policy of a run is
+                chosen, or ``"test"``, which is reported. They have no start in common.
+
         Returns:
             list of dict: one dictionary for each episode, JSON values.
         """
 
     @abstractmethod
-    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns the lines of the table of results that belong to one policy."""
+    def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Returns the results of an evaluation.
 
-    @abstractmethod
-    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Returns the success of a method: groups of independent results."""
+        Args:
+            episodes (sequence of dict): as :meth:`play` returns them.
 
-    @abstractmethod
-    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Returns the lines that report the success of all methods."""
-
-    @abstractmethod
-    def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the main result of a study in one line."""
+        Returns:
+            list of dict: for each task and measure ``"task"``, ``"measure"``, the
+            number of ``"episodes"``, and their mean ``"value"``. The first measure is
+            that of success.
+        """
 
     def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
         """Draws figures of its own. Defaults to none.
@@ -170,10 +179,3 @@ class Environment(ABC):
             list of str: remarks, for example on figures that were left out.
         """
         return []
-
-
-def compare_methods(shares: Mapping[str, str]) -> str:
-    """Joins the results of methods: ``"0/40 without, 40/40 with counterfactuals"``."""
-    if {"none", "caiac"} <= shares.keys():
-        return f"{shares['none']} without, {shares['caiac']} with counterfactuals"
-    return ", ".join(f"{share} ({name})" for name, share in shares.items())

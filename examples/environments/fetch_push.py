@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
 from environments.base import Environment, Evaluation, compare_methods
-from torchrl_caiac.data import load_minari, load_transitions, mix_trajectories
+from environments.playing import Split, play_together
+from torchrl_caiac.data import (
+    load_minari,
+    load_transitions,
+    mix_trajectories,
+    select_successful,
+)
 from torchrl_caiac.data.digests import data_digest, data_source
 from torchrl_caiac.envs.fetch_push import (
     FetchPushCubes,
@@ -33,14 +38,16 @@ POSITIONS = {
     name: LAYOUT.columns[name][:n]
     for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
 }
-MEASURES = ("full", "cube0", "cube1", "final")
+MEASURES = ("full", "cube0", "cube1")
 MAKERS = {"expert": create_fetch_push_expert, "random": create_fetch_push_random}
 
 
 class FetchPush(Environment):
-    """Two cubes, and a part of the data to learn from, ``env.fraction``.
+    """Two cubes, and a number of successful demonstrations, ``env.demonstrations``.
 
-    ``held_out`` are episodes with other seeds, which only check the scores.
+    ``rows`` are the demonstrations, whole, and random episodes; ``demonstrations`` are
+    the demonstrations up to their first success. ``held_out`` are episodes with other
+    seeds, which only check the scores.
     """
 
     layout = LAYOUT
@@ -53,8 +60,8 @@ class FetchPush(Environment):
 
     @property
     def folder(self) -> Path:
-        """The folder of the fraction of the data."""
-        return self.out / f"fraction-{self.settings.fraction:g}"
+        """The folder of this number of demonstrations."""
+        return self.out / f"demonstrations-{self.settings.demonstrations}"
 
     @property
     def cubes(self) -> dict[str, float]:
@@ -64,11 +71,10 @@ class FetchPush(Environment):
         return {name: settings[name] for name in names if name in settings}
 
     def collect(self, *, progress: bool = False) -> None:
-        """Collects what is missing of the datasets, and mixes the transitions."""
+        """Collects what is missing of the datasets, and selects the transitions."""
         settings, out = self.settings.collect, self.out
-        total = settings.expert + settings.random
-        shares = [settings.expert / total, settings.random / total]
-        held_out = round(settings.held_out * shares[0])
+        share = settings.expert / (settings.expert + settings.random)
+        held_out = round(settings.held_out * share)
         parts = {
             "expert": (settings.expert, settings.seed),
             "random": (settings.random, settings.seed + 1),
@@ -91,29 +97,55 @@ class FetchPush(Environment):
                 progress=progress,
             )
             load_minari(dataset, out / name, infos=["simulator"], progress=progress)
-        for path, names, fraction in (
-            (self.folder / "rows", ("expert", "random"), self.settings.fraction),
-            (out / "held_out", ("held_out_expert", "held_out_random"), 1.0),
-        ):
-            if path.exists():
-                mixed = {"mixed": [data_digest(out / name) for name in names]}
-                if data_source(path) != mixed:
-                    raise ValueError(
-                        f"{path} was mixed from other data than {names} in {out} have "
-                        "now: delete it, or set another folder with out=..."
-                    )
-            else:
-                mix_trajectories(
-                    [load_transitions(out / name) for name in names],
-                    shares=shares if fraction < 1 else None,
-                    fraction=fraction,
-                    seed=settings.seed,
-                    path=path,
+        self._mix(out / "held_out", ("held_out_expert", "held_out_random"))
+        number, folder = self.settings.demonstrations, self.folder
+        expert = load_transitions(out / "expert")
+        for name, cut in (("successful", False), ("demonstrations", True)):
+            if not (folder / name).exists():
+                select_successful(
+                    expert,
+                    ("next", "reward"),
+                    above=-0.5,
+                    cut=cut,
+                    trajectories=number,
+                    path=folder / name,
                 )
+        names = (f"{folder.name}/successful", "random")
+        self._mix(folder / "rows", names, settings.random_ratio)
+
+    def _mix(
+        self, path: Path, names: Sequence[str], ratio: float | None = None
+    ) -> None:
+        """Mixes datasets; with all of the first, and ``ratio`` times as many others."""
+        out, shares, trajectories = self.out, None, None
+        parts = [load_transitions(out / name) for name in names]
+        mixed: dict[str, Any] = {"mixed": [data_digest(out / name) for name in names]}
+        if path.exists():
+            if data_source(path) != mixed:
+                raise ValueError(
+                    f"{path} was mixed from other data than {list(names)} in {out} "
+                    "have now: delete it, or set another folder with out=..."
+                )
+            return
+        if ratio is not None:
+            first = len(parts[0]["episode"].unique_consecutive())
+            trajectories = round(first * (1 + ratio))
+            shares = [first / trajectories, 1 - first / trajectories]
+        mix_trajectories(
+            parts,
+            shares=shares,
+            trajectories=trajectories,
+            seed=self.settings.collect.seed,
+            path=path,
+        )
 
     def rows(self) -> TensorDictBase:
-        """Returns the fraction of the expert's and the random episodes."""
+        """Returns the demonstrations and the random episodes."""
         return load_transitions(self.folder / "rows")
+
+    def demonstrations(self) -> TensorDictBase:
+        """Returns the demonstrations up to their first success."""
+        return load_transitions(self.folder / "demonstrations")
 
     def simulator(self, num_actions: int) -> SimulatorInfluence:
         """Returns the simulator as an estimator."""
@@ -131,16 +163,29 @@ class FetchPush(Environment):
         positions = {name: LAYOUT.columns[name][:3] for name in LAYOUT.names}
         return DistanceInfluence(LAYOUT, positions, action_only=action_only)
 
-    def play(self, actor: Any, seed: int, folder: Path) -> list[dict[str, Any]]:
+    def play(
+        self, actor: Any, seed: int, folder: Path, *, split: Split = "test"
+    ) -> list[dict[str, Any]]:
         """Plays episodes from the same starts for all runs."""
         settings = self.settings.evaluate
-        return play(
-            actor,
-            episodes=settings.episodes,
-            steps=self.settings.collect.steps,
-            seed=settings.seed,
-            **self.cubes,
-        )
+        episodes, first = {
+            "test": (settings.episodes, settings.seed),
+            "validation": (settings.validation_episodes, settings.validation_seed),
+        }[split]
+        steps = self.settings.collect.steps
+        return play(actor, episodes=episodes, steps=steps, seed=first, **self.cubes)
+
+    def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Returns the shares of episodes in which both, and each, cube arrived."""
+        return [
+            {
+                "task": "two cubes",
+                "measure": name,
+                "episodes": len(episodes),
+                "value": float(np.mean([episode[name] for episode in episodes])),
+            }
+            for name in MEASURES
+        ]
 
     def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
         """Returns one line for each policy: the shares of its episodes."""
@@ -199,39 +244,30 @@ def play(
 ) -> list[dict[str, bool]]:
     """Plays episodes in parallel, from the starts that the seed determines.
 
+    An episode ends as soon as all cubes are at their goals.
+
     Returns:
         list of dict: for each episode whether all cubes were at their goals at some
-        step (``full``) and at the last one (``final``), and whether each cube was at
-        some step.
+        step (``full``), and whether each cube was.
     """
     make = partial(FetchPushCubes, 2, max_episode_steps=steps, **cubes)
     envs = [make() for _ in range(episodes)]
-    states = [env.reset(seed=seed + i)[0] for i, env in enumerate(envs)]
-    reached = np.zeros((steps, episodes, 2), dtype=np.bool_)
-    keys = [key for key in actor.in_keys if key in states[0]]
-    # What a policy carries from step to step, for example a plan.
-    carried = TensorDict({"is_init": torch.ones(episodes, 1, dtype=torch.bool)})
-    carried.batch_size = [episodes]
-    for step in range(steps):
-        inputs = {k: torch.from_numpy(np.stack([s[k] for s in states])) for k in keys}
-        with torch.no_grad():
-            output = actor(TensorDict(inputs, [episodes]).update(carried))
-        actions = output["action"].numpy()
-        carried = output.get("next", TensorDict({}, [episodes]))
-        for i, env in enumerate(envs):
-            states[i], _, _, _, info = env.step(actions[i])
-            reached[step, i] = info["cube_success"]
+    reached = np.zeros((episodes, 2), dtype=np.bool_)
+    full = np.zeros(episodes, dtype=np.bool_)
+
+    def step(number: int, action: np.ndarray) -> tuple[dict[str, Any], bool]:
+        state, _, terminated, truncated, info = envs[number].step(action)
+        reached[number] |= info["cube_success"]
+        full[number] = info["cube_success"].all()
+        return state, bool(full[number] or terminated or truncated)
+
+    starts = [env.reset(seed=seed + number)[0] for number, env in enumerate(envs)]
+    play_together(actor, starts, step)
     for env in envs:
         env.close()
-    together = reached.all(-1)
     return [
-        {
-            "full": bool(together[:, i].any()),
-            "cube0": bool(reached[:, i, 0].any()),
-            "cube1": bool(reached[:, i, 1].any()),
-            "final": bool(together[-1, i]),
-        }
-        for i in range(episodes)
+        {"full": bool(all_), "cube0": bool(first), "cube1": bool(second)}
+        for all_, (first, second) in zip(full, reached, strict=True)
     ]
 
 

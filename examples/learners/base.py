@@ -9,7 +9,9 @@ from typing import Any, ClassVar
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
+from torchrl.envs import Transform
 
 from environments.base import Environment
 from methods.base import Method
@@ -36,6 +38,14 @@ class Learner(ABC):
     extendable: ClassVar[bool] = False
     """Whether ``steps`` may be raised later, for finished runs to be extended."""
 
+    reads: ClassVar[tuple[NestedKey, ...]] = (
+        "observation",
+        "action",
+        "episode",
+        *[("next", name) for name in ("observation", "done")],
+    )
+    """The leaves of the rows that learning reads, besides scores and goals."""
+
     def __init__(
         self,
         settings: DictConfig,
@@ -60,12 +70,67 @@ class Learner(ABC):
             "augmentation": OmegaConf.to_container(self.augmentation, resolve=True),
             "seed": seed,
             "layout": self.environment.layout.to_dict(),
-            "data": content_digests(self.environment.rows(), self.method.score_key),
+            "data": content_digests(self.stored_rows(), self.method.score_key),
         }
 
-    def rows(self) -> TensorDictBase:
-        """Returns the training data, by default those of the environment."""
+    def stored_rows(self) -> TensorDictBase:
+        """Returns the memory-mapped transitions that the method scores.
+
+        Defaults to all rows of the environment.
+        """
         return self.environment.rows()
+
+    def rows(self) -> TensorDictBase:
+        """Returns the training data, by default :meth:`stored_rows`."""
+        return self.stored_rows()
+
+    def read_leaves(
+        self, rows: TensorDictBase, *further: NestedKey, goals: bool = True
+    ) -> TensorDictBase:
+        """Returns what learning reads of the rows, in memory.
+
+        Args:
+            rows (TensorDictBase): all rows, ``[T]``.
+            *further (NestedKey): leaves besides :attr:`reads`.
+
+        Keyword Args:
+            goals (bool): whether desired goals are among them.
+
+        Raises:
+            KeyError: a leaf is missing.
+        """
+        scores = [] if self.method.score_key is None else [self.method.score_key]
+        desired: list[NestedKey] = ["desired_goal"] if goals else []
+        keys = [*self.reads, *desired, *scores, *further]
+        present = rows.keys(include_nested=True)
+        missing = [key for key in keys if key not in present]
+        if missing:
+            raise KeyError(
+                f"the rows of {type(self.environment).__name__} lack {missing}, which "
+                f"learner={self.settings.name} reads: score the data first (score.py), "
+                "and for desired goals choose learner.goals=future if the learner has "
+                "it"
+            )
+        return rows.select(*keys).clone()
+
+    def counterfactuals(self, **options: Any) -> Transform | None:
+        """Returns the method's transform with the settings of the environment.
+
+        Args:
+            **options (Any): further arguments of the transform, such as ``window``.
+
+        Returns:
+            Transform, optional: to append to the buffer; ``None`` without augmentation.
+        """
+        settings = self.augmentation
+        if settings.get("lookahead") is not None:
+            options["lookahead"] = settings.lookahead
+        return self.method.transform(
+            self.environment.layout,
+            settings.counterfactual_ratio,
+            swap_prob=settings.swap_prob,
+            **options,
+        )
 
     @abstractmethod
     def make_buffer(self, rows: TensorDictBase) -> ReplayBuffer:

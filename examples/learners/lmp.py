@@ -7,14 +7,10 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import (
-    ImmutableDatasetWriter,
-    SliceSampler,
-    TensorDictReplayBuffer,
-    TensorStorage,
-)
+from torchrl.data import TensorDictReplayBuffer
 
 from learners.base import Learner
+from learners.imitation import imitation_buffer
 from torchrl_caiac.modules import LMPActor, LMPModel
 from torchrl_caiac.objectives import LMPLoss
 from torchrl_caiac.transforms import WindowGoal
@@ -25,34 +21,30 @@ __all__ = ["LMP"]
 class LMP(Learner):
     """Plans for windows of trajectories, whose goals are later states."""
 
+    def stored_rows(self) -> TensorDictBase:
+        """Returns the demonstrations."""
+        return self.environment.demonstrations()
+
+    def rows(self) -> TensorDictBase:
+        """Returns what learning reads of the demonstrations, in memory."""
+        return self.read_leaves(self.stored_rows(), goals=False)
+
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of windows, their goals, and counterfactuals."""
-        settings, layout = self.settings, self.environment.layout
+        settings = self.settings
         goals = WindowGoal(
-            layout,
+            self.environment.layout,
             window=settings.window,
             mixture=dict(settings.goals),
             p=settings.goal_p,
         )
-        rb = TensorDictReplayBuffer(
-            storage=TensorStorage(rows),
-            sampler=SliceSampler(
-                slice_len=settings.window, traj_key="episode", cache_values=True
-            ),
-            writer=ImmutableDatasetWriter(),
-            sample_unit=goals,
+        return imitation_buffer(
+            self,
+            rows,
             batch_size=settings.windows * settings.window,
-        )
-        rb.append_transform(goals)
-        augmentation = self.method.transform(
-            layout,
-            self.augmentation.counterfactual_ratio,
-            swap_prob=self.augmentation.swap_prob,
             window=settings.window,
+            goals=goals,
         )
-        if augmentation is not None:
-            rb.append_transform(augmentation)
-        return rb
 
     def setup(self, rows: TensorDictBase, seed: int) -> None:
         """Makes the model, with the statistics of the rows."""

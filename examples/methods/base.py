@@ -54,6 +54,8 @@ class Method(ABC):
     """The world models that are fitted for it."""
     fits_itself: ClassVar[bool] = False
     """Whether :meth:`estimator` fits something that takes time."""
+    env_settings: ClassVar[tuple[str, ...]] = ()
+    """The parts of ``env`` that its scores depend on, besides ``env.score``."""
     score_key: ClassVar[NestedKey | None] = None
     """The leaf of its scores; ``None`` where it needs none."""
 
@@ -79,6 +81,13 @@ class Method(ABC):
             )
 
     def scoring_options(self, scoring: Scoring) -> dict[str, Any]:
-        """Returns options of ``score_buffer``, by default those of ``env.score``."""
-        options = {key: scoring.settings[key] for key in ("batch_size", "lookahead")}
-        return {**options, "smoothing": scoring.settings.smoothing}
+        """Returns options of ``score_buffer``, by default those of ``env.score``.
+
+        Scores are those of single states: transforms look ahead.
+        """
+        settings = scoring.settings
+        return {
+            "batch_size": settings.batch_size,
+            "smoothing": settings.smoothing,
+            "lookahead": 0,
+        }

@@ -25,6 +25,7 @@ class Oracle(CAIAC):
 
     label = "with counterfactuals (ground truth)"
     models = ()
+    env_settings = ("truth",)
     score_key = ("oracle", "score")
     threshold: float = 0.5
     num_actions: int = 16
@@ -39,6 +40,6 @@ class Oracle(CAIAC):
         """Returns options without smoothing, for some rows only."""
         return {
             "batch_size": self.batch_size,
-            "lookahead": scoring.settings.lookahead,
+            "lookahead": 0,
             "every": self.every,
         }

@@ -18,13 +18,13 @@ from learners.base import Learner
 from methods.base import Method
 
 __all__ = [
-    "last_policies",
+    "candidates",
+    "kept_steps",
     "make_environment",
     "make_learner",
     "make_method",
     "make_methods",
     "policy_file",
-    "policy_steps",
     "run_folder",
 ]
 
@@ -69,7 +69,7 @@ def make_learner(cfg: DictConfig, method: str) -> Learner:
 
 def run_folder(cfg: DictConfig, method: str, seed: int) -> Path:
     """Returns the folder of a run: its checkpoint, policies, log and evaluation."""
-    return make_environment(cfg).folder / "runs" / f"{method}-seed{seed}"
+    return make_environment(cfg).folder / cfg.runs / f"{method}-seed{seed}"
 
 
 def policy_file(cfg: DictConfig, method: str, seed: int, step: int) -> Path:
@@ -77,23 +77,19 @@ def policy_file(cfg: DictConfig, method: str, seed: int, step: int) -> Path:
     return run_folder(cfg, method, seed) / "policies" / f"{step}.pt"
 
 
-def policy_steps(cfg: DictConfig) -> list[int]:
-    """Returns the training steps after which policies are evaluated."""
+def kept_steps(cfg: DictConfig) -> list[int]:
+    """Returns the training steps after which policies are kept."""
     last = cfg.learner.steps
     every = cfg.learner.keep_every or last
-    kept = range(every, last + 1, every)
+    kept = list(range(every, last + 1, every))
     if not kept:
         raise ValueError(
             f"learner.steps is {last}, expected at least learner.keep_every, {every}: "
             "no policy is kept"
         )
-    settings = cfg.env.evaluate
-    result = set(kept[-settings.last :])
-    if settings.curve_every is not None:
-        result |= {step for step in kept if step % settings.curve_every == 0}
-    return sorted(result)
+    return kept
 
 
-def last_policies(cfg: DictConfig) -> list[int]:
-    """Returns the steps of the policies whose mean is the result of a run."""
-    return policy_steps(cfg)[-cfg.env.evaluate.last :]
+def candidates(cfg: DictConfig) -> list[int]:
+    """Returns the training steps whose policies are compared on validation starts."""
+    return kept_steps(cfg)[-(cfg.validation.policies or 0) :]

@@ -19,6 +19,7 @@ from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
 from torchrl_caiac.data.open_dataset import FORMATS, DatasetFormat, open_dataset
+from torchrl_caiac.data.select_successful import select_successful
 from torchrl_caiac.data.to_minari import to_minari
 from torchrl_caiac.data.transition_writer import TransitionWriter
 from torchrl_caiac.data.write_transitions import write_transitions
@@ -46,6 +47,7 @@ __all__ = [
     "offline_buffer",
     "open_dataset",
     "record_episode",
+    "select_successful",
     "to_minari",
     "verify_digests",
     "write_digests",

@@ -14,6 +14,7 @@ from torchrl.data import TensorStorage
 from torchrl_caiac._fingerprints import (
     fingerprint_key,
     is_fingerprint_of,
+    rows_with_fingerprints,
     settings_of,
     state_hash,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "find_leaves",
     "new_leaves",
     "row_states",
+    "valid_scores",
 ]
 
 _CHUNK = 1 << 16
@@ -240,3 +242,34 @@ def _new_leaf(
                 data.set(key, leaf)
             leaf = data.get(key)
     return leaf.as_subclass(torch.Tensor)
+
+
+def valid_scores(
+    data: TensorDictBase, key: NestedKey, layout: EntityLayout, length: int
+) -> torch.Tensor:
+    """Returns stored scores, NaN where they are those of other states.
+
+    Args:
+        data (TensorDictBase): the rows of a storage, at least ``T``.
+        key (NestedKey): the scores.
+        layout (EntityLayout): the entities.
+        length (int): the number of rows that were written, ``T``.
+
+    Returns:
+        torch.Tensor: ``[T, ...]``, the stored tensor itself if all scores are valid.
+    """
+    scores = data.get(key).as_subclass(torch.Tensor)[:length]
+    known = data.get(fingerprint_key(key), None)
+    if known is None:
+        return scores
+    is_valid = rows_with_fingerprints(
+        data,
+        known.as_subclass(torch.Tensor)[:length],
+        layout.in_keys,
+        [layout.next(key) for key in layout.in_keys],
+        layout.names,
+    )
+    if bool(is_valid.all()):
+        return scores
+    where = is_valid.view(-1, *(1,) * (scores.ndim - 1))
+    return torch.where(where, scores, torch.nan)

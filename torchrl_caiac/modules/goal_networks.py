@@ -36,10 +36,12 @@ class _CastLinear(nn.Linear):
         device: torch.device | None = None,
         compute_dtype: torch.dtype | None = None,
         relu: bool = False,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__(in_features, out_features, bias=bias, device=device)
         self.compute_dtype = compute_dtype
         self.relu = relu
+        self.layer_norm = layer_norm
 
     def forward(
         self, value: torch.Tensor, params: TensorDictBase | None = None
@@ -51,10 +53,15 @@ class _CastLinear(nn.Linear):
             _warn_without_bfloat16()
         value, weight, bias = (x.to(dtype) for x in (value, *pair))
         if weight.ndim == 2:
-            return linear(value, weight, bias, self.relu)
-        rows = value.reshape(len(weight), -1, value.shape[-1])
-        out = torch.baddbmm(bias.unsqueeze(-2), rows, weight.mT)
-        out = out.reshape(*value.shape[:-1], -1)
+            if not self.layer_norm:
+                return linear(value, weight, bias, self.relu)
+            out = linear(value, weight, bias)
+        else:
+            rows = value.reshape(len(weight), -1, value.shape[-1])
+            out = torch.baddbmm(bias.unsqueeze(-2), rows, weight.mT)
+            out = out.reshape(*value.shape[:-1], -1)
+        if self.layer_norm:
+            out = nn.functional.layer_norm(out, out.shape[-1:])
         return out.relu() if self.relu else out
 
     def extra_repr(self) -> str:
@@ -104,6 +111,7 @@ def _mlp(
     out_features: int,
     hidden_sizes: Sequence[int],
     hidden_dtype: torch.dtype | None,
+    layer_norm: bool = False,
 ) -> _MLP:
     hidden_sizes = list(hidden_sizes)
     if not hidden_sizes or any(
@@ -117,7 +125,7 @@ def _mlp(
         raise ValueError(
             f"hidden_dtype must be a floating point dtype, got {hidden_dtype}"
         )
-    hidden = {"compute_dtype": hidden_dtype, "relu": True}
+    hidden = {"compute_dtype": hidden_dtype, "relu": True, "layer_norm": layer_norm}
     return _MLP(
         in_features,
         out_features,
@@ -240,6 +248,10 @@ class GoalConditionedCritic(TensorDictModuleBase):
 
     Keyword Args:
         hidden_dtype (torch.dtype, optional): as in :class:`GoalConditionedActor`.
+        layer_norm (bool): whether each hidden layer is normalised over its units,
+            before its ReLU and without weights of its own. Values of actions that the
+            data lack then stay bounded, which offline learning needs (Ball et al.
+            2023). Defaults to ``False``.
         action_key (NestedKey): the action, ``[*B, A]``. Defaults to ``"action"``.
         out_key (NestedKey): where the value is written, ``[*B, 1]``. Defaults to
             ``"state_action_value"``.
@@ -275,6 +287,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
         hidden_sizes: Sequence[int] = (256, 256, 256),
         *,
         hidden_dtype: torch.dtype | None = None,
+        layer_norm: bool = False,
         action_key: NestedKey = "action",
         out_key: NestedKey = "state_action_value",
     ) -> None:
@@ -283,7 +296,9 @@ class GoalConditionedCritic(TensorDictModuleBase):
         # A loss stacks the buffers of its critics. Shared ones would become views of
         # one memory, to which load_state_dict cannot write.
         self.features = copy.deepcopy(features)
-        self.network = _mlp(features.width + action_dim, 1, hidden_sizes, hidden_dtype)
+        self.network = _mlp(
+            features.width + action_dim, 1, hidden_sizes, hidden_dtype, layer_norm
+        )
         self.in_keys = [*features.in_keys, as_key(action_key)]
         self.out_keys = [as_key(out_key)]
 

@@ -14,6 +14,7 @@ from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 from torchrl_caiac.transforms.draws import draw_batch_donors, uninfluenced
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.lookahead import LookaheadArgument
 from torchrl_caiac.transforms.rewards import RewardFn, TerminatedFn
 from torchrl_caiac.transforms.thresholds import ThresholdArgument
 
@@ -77,6 +78,15 @@ class CAIACTransform(CounterfactualTransform):
         swap_prob (float): probability of swapping each uninfluenced entity. Defaults
             to 1.
         window (int): rows in a window, κ. Defaults to 1.
+        lookahead (int, str or None): whether influence that comes later in the
+            trajectory counts too. A policy acts for what comes next: while the hand
+            moves to the cup, a cup that is swapped away leaves its action without a
+            reason. ``"next"``: the entity that is influenced next is not swapped
+            either, nor is it a donor. A number L: nor are entities that are influenced
+            in one of the L states after the row (or after the last row of the window).
+            ``None``: only the row's own score counts, as in Algorithm 1. It reads the
+            trajectories of the buffer that samples, and of the donor buffer, with one
+            byte for each of their rows and entities. Defaults to ``None``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
             Defaults to the rows of the same batch. A donor buffer needs scores and the
             same layout. It is pickled with the transform.
@@ -143,6 +153,7 @@ class CAIACTransform(CounterfactualTransform):
         rows: Literal["random", "last"] = "random",
         swap_prob: float = 1.0,
         window: int = 1,
+        lookahead: LookaheadArgument = None,
         donors: ReplayBuffer | TensorStorage | None = None,
         score_key: NestedKey = ("caiac", "score"),
         unscored: Literal["raise", "keep"] = "raise",
@@ -160,6 +171,7 @@ class CAIACTransform(CounterfactualTransform):
             rows=rows,
             swap_prob=swap_prob,
             window=window,
+            lookahead=lookahead,
             donors=donors,
             score_key=score_key,
             unscored=unscored,

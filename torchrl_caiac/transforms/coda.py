@@ -21,6 +21,7 @@ from torchrl_caiac.transforms.components import (
 from torchrl_caiac.transforms.counterfactual import CounterfactualTransform
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.lookahead import LookaheadArgument
 from torchrl_caiac.transforms.rewards import RewardFn, TerminatedFn
 
 __all__ = ["CoDATransform"]
@@ -59,6 +60,9 @@ class CoDATransform(CounterfactualTransform):
             Defaults to ``"random"``.
         swap_prob (float): probability of swapping each component. Defaults to 1.
         window (int): rows in a window, κ. Defaults to 1.
+        lookahead (int, str or None): as in :class:`~torchrl_caiac.CAIACTransform`. An
+            entity is influenced where its component contains the action or a fixed
+            entity. Defaults to ``None``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
             Defaults to the rows of the same batch. A donor buffer needs graphs and the
             same layout. It is pickled with the transform.
@@ -128,6 +132,7 @@ class CoDATransform(CounterfactualTransform):
         rows: Literal["random", "last"] = "random",
         swap_prob: float = 1.0,
         window: int = 1,
+        lookahead: LookaheadArgument = None,
         donors: ReplayBuffer | TensorStorage | None = None,
         graph_key: NestedKey = ("coda", "graph"),
         unscored: Literal["raise", "keep"] = "raise",
@@ -145,6 +150,7 @@ class CoDATransform(CounterfactualTransform):
             rows=rows,
             swap_prob=swap_prob,
             window=window,
+            lookahead=lookahead,
             donors=donors,
             score_key=graph_key,
             unscored=unscored,

@@ -14,7 +14,7 @@ from torchrl.data import HERReplayBuffer, ReplayBuffer, TensorStorage
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._keys import as_key
-from torchrl_caiac._torchrl import sampling_buffer
+from torchrl_caiac._torchrl import sampled_rows, sampling_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import (
@@ -29,6 +29,12 @@ from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
 from torchrl_caiac.transforms.free_share import FreeShare
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.lookahead import (
+    Lookahead,
+    LookaheadArgument,
+    check_lookahead,
+    hold_entities,
+)
 from torchrl_caiac.transforms.rewards import (
     GoalLeaves,
     RewardFn,
@@ -63,6 +69,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             ``"last"``.
         swap_prob (float): probability of swapping what may be swapped.
         window (int): rows in a window, κ.
+        lookahead (int or str, optional): how far ahead influence counts: steps, or
+            ``"next"``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
         score_key (NestedKey): the scores.
         unscored (str): what happens to rows without valid scores: ``"raise"`` or
@@ -89,6 +97,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         rows: Literal["random", "last"],
         swap_prob: float,
         window: int,
+        lookahead: LookaheadArgument = None,
         donors: ReplayBuffer | TensorStorage | None,
         score_key: NestedKey,
         unscored: Literal["raise", "keep"],
@@ -121,6 +130,17 @@ class CounterfactualTransform(RandomTransform, ABC):
         )
         if goals is not None:
             self._check_goals(goals, donors)
+        self.lookahead = check_lookahead(lookahead)
+        self._lookahead: Lookahead | None = None
+        if self.lookahead is not None:
+            self._lookahead = Lookahead(
+                self.lookahead,
+                layout,
+                score_key=self.score_key,
+                keys=self.keys,
+                free=self._free_rows,
+                competing=self._competing,
+            )
         # In a tuple, so that torch does not register the goals as a submodule.
         self._donors: tuple[BufferDonors, ...] = ()
         if donors is not None:
@@ -133,6 +153,7 @@ class CounterfactualTransform(RandomTransform, ABC):
                     score_key=self.score_key,
                     keys=self.keys,
                     goals=goals,
+                    lookahead=self._lookahead,
                 ),
             )
         self._planner = SwapPlanner(layout)
@@ -195,6 +216,16 @@ class CounterfactualTransform(RandomTransform, ABC):
             torch.Tensor: ``[B, N]``, zero for entities that may not be swapped.
         """
 
+    def _free_rows(self, scores: torch.Tensor) -> torch.Tensor:
+        """Returns what may be swapped in single rows ``[n]``, bool ``[n, N]``."""
+        return self.swappable(scores.repeat_interleave(self.window, 0)) != 0
+
+    def _competing(self) -> torch.Tensor:
+        """Returns the entities that lookahead may lock, bool ``[N]``."""
+        known = self._thresholds.numbers
+        never = -1.0
+        return torch.tensor([known.get(x, never) >= 0 for x in self.layout.names])
+
     # --- settings and state ----------------------------------------------------------
 
     @property
@@ -252,6 +283,8 @@ class CounterfactualTransform(RandomTransform, ABC):
         """
         for donors in self._donors:
             donors.refresh()
+        if self._lookahead is not None:
+            self._lookahead.refresh()
 
     def share_memory_(self: _Transform) -> _Transform:
         """Moves the counters to shared memory, for buffers of several processes."""
@@ -417,6 +450,9 @@ class CounterfactualTransform(RandomTransform, ABC):
         if self.check:
             checked = self._batch_check.before(tensordict, scores)
             scores = checked.scores
+        if self._lookahead is not None:
+            locked = self._locked(tensordict, self._lookahead)
+            scores = hold_entities(scores, locked)
         if not self._free_share.is_done:
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)
@@ -434,6 +470,17 @@ class CounterfactualTransform(RandomTransform, ABC):
             self._no_donor = self._no_donor.to(draw.no_donor.device)
         self._no_donor += draw.no_donor
         return out if len(shape) == 1 else out.reshape(shape)
+
+    def _locked(self, td: TensorDictBase, lookahead: Lookahead) -> torch.Tensor:
+        """Returns the entities that the rows of a batch lock, bool ``[B, N]``."""
+        found = sampled_rows()
+        if found is None:
+            raise RuntimeError(
+                f"lookahead={self.lookahead!r} reads the trajectories of the buffer "
+                "that samples, but this batch is not sampled from a buffer: get it by "
+                "rb.sample() of the buffer that the transform is appended to"
+            )
+        return lookahead.locked(*found, td.get(self.score_key))
 
     def _check_buffer(self, td: TensorDictBase) -> None:
         """Raises if the buffer will relabel counterfactual rows of the batch."""
@@ -517,7 +564,7 @@ class CounterfactualTransform(RandomTransform, ABC):
             f"threshold={self._thresholds}, "
             f"counterfactual_ratio={self.counterfactual_ratio}, "
             f"rows={self.chosen_rows!r}, swap_prob={self.swap_prob}, "
-            f"window={self.window}, donors={donors}"
+            f"window={self.window}, lookahead={self.lookahead!r}, donors={donors}"
         )
 
     def __repr__(self) -> str:

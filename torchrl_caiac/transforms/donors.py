@@ -10,17 +10,15 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
-from torchrl_caiac._fingerprints import (
-    fingerprint_key,
-    matches,
-    rows_with_fingerprints,
-)
+from torchrl_caiac._fingerprints import fingerprint_key, matches
 from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 from torchrl_caiac.transforms.draws import DonorIndex, SwapDraw, draw_buffer_donors
 from torchrl_caiac.transforms.indexing import plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
+from torchrl_caiac.transforms.lookahead import Lookahead, hold_entities
 from torchrl_caiac.transforms.swap import SwapLeaf, SwapPlan, apply_swap
 from torchrl_caiac.transforms.thresholds import EntityThresholds
 
@@ -155,6 +153,7 @@ class BufferDonors:
         score_key (NestedKey): the scores, ``[T, N]``.
         keys (TransformKeys): trajectory ids and end flags.
         goals (WindowGoal, optional): draws the goals of donor windows.
+        lookahead (Lookahead, optional): what rows lock by later influence.
 
     Raises:
         TypeError: ``donors`` is not a buffer or storage.
@@ -173,6 +172,7 @@ class BufferDonors:
         score_key: NestedKey,
         keys: TransformKeys,
         goals: WindowGoal | None = None,
+        lookahead: Lookahead | None = None,
     ) -> None:
         if not isinstance(donors, (ReplayBuffer, TensorStorage)):
             raise TypeError(
@@ -186,6 +186,7 @@ class BufferDonors:
         self.score_key = score_key
         self.keys = keys
         self.goals = goals
+        self.lookahead = lookahead
         self._built: tuple[Any, Any, TrajectoryIndex | None, TensorDictBase] | None = (
             None
         )
@@ -257,29 +258,10 @@ class BufferDonors:
                 trajectory_key=self.keys.trajectory,
                 done_key=self.keys.done,
             )
-        eligible = self.eligible(self._valid(data, scores), trajectories)
-        return eligible, trajectories, data
-
-    def _valid(self, data: TensorDictBase, scores: torch.Tensor) -> torch.Tensor:
-        """Returns the scores ``[T, ...]``, NaN where they are those of other states."""
-        layout, length = self.layout, len(self.storage)
-        scores = plain_tensor(scores)[:length]
-        known = data.get(fingerprint_key(self.score_key), None)
-        if known is None:
-            return scores
-        next_keys = [layout.next(key) for key in layout.in_keys]
-        is_valid = rows_with_fingerprints(
-            data,
-            plain_tensor(known)[:length],
-            layout.in_keys,
-            next_keys,
-            layout.names,
-        )
-        if bool(is_valid.all()):
-            return scores
-        return torch.where(
-            is_valid.view(-1, *(1,) * (scores.ndim - 1)), scores, torch.nan
-        )
+        scores = valid_scores(data, self.score_key, self.layout, len(storage))
+        if self.lookahead is not None:
+            scores = hold_entities(scores, self.lookahead.table(self.donors))
+        return self.eligible(scores, trajectories), trajectories, data
 
     def draw(
         self,

@@ -1,0 +1,84 @@
+"""Goal-conditioned behaviour cloning."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import BCLoss, LossModule
+
+from learners.goal_conditioned import GoalConditioned, descend
+from learners.imitation import has_own_goals, imitation_buffer
+from torchrl_caiac.transforms import WindowGoal
+
+__all__ = ["BC"]
+
+
+class _BCLoss(BCLoss):
+    # Without it TorchRL warns that its own class does not name it.
+    target_actor_network_params: TensorDictParams | None
+
+
+class BC(GoalConditioned):
+    """Repeats the actions of demonstrations, of counterfactual ones too."""
+
+    window = 1
+    """Rows that follow each other, from which a row to learn from is made."""
+
+    def stored_rows(self) -> TensorDictBase:
+        """Returns the demonstrations."""
+        return self.environment.demonstrations()
+
+    def rows(self) -> TensorDictBase:
+        """Returns what learning reads of the demonstrations, in memory."""
+        own = has_own_goals(self.settings)
+        return self.read_leaves(self.stored_rows(), goals=own)
+
+    def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
+        """Makes the buffer of transitions, their goals, and counterfactuals."""
+        goals = None
+        if not has_own_goals(self.settings):
+            goals = WindowGoal(
+                self.environment.layout,
+                window=self.window,
+                mixture=dict(self.settings.future_goals),
+            )
+        return imitation_buffer(
+            self,
+            rows,
+            batch_size=self.rows_at_once * self.window,
+            window=self.window,
+            goals=goals,
+        )
+
+    def setup(self, rows: TensorDictBase, seed: int) -> None:
+        """Makes the policy, with the statistics of some batches."""
+        features = self.start(rows, seed)
+        self.actor = self.make_actor(features)
+        self.loss_module = self.make_loss()
+        self.optimizer = torch.optim.AdamW(
+            self.loss_module.parameters(),
+            lr=self.settings.lr,
+            weight_decay=self.settings.weight_decay,
+            fused=True,
+        )
+        self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(
+            self.optimizer, self.settings.steps
+        )
+        self.parts = {
+            "loss": self.loss_module,
+            "optimizer": self.optimizer,
+            "scheduler": self.scheduler,
+        }
+
+    def make_loss(self) -> LossModule:
+        """Returns the loss of the policy, which writes one leaf."""
+        return _BCLoss(self.actor, loss_function="l2")
+
+    def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
+        """Takes one step of AdamW."""
+        losses = self.loss_module(batch)
+        (name,) = losses.keys()
+        descend(self.optimizer, losses[name])
+        self.scheduler.step()
+        return {name: losses[name].detach(), **self.share_swapped(batch)}

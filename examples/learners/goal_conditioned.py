@@ -1,0 +1,111 @@
+"""What learners of goal-conditioned networks share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import ReplayBuffer
+
+from learners.base import Learner
+from torchrl_caiac.modules import GoalConditionedActor, GoalFeatures
+
+__all__ = ["GoalConditioned", "descend"]
+
+_STATISTICS_BATCHES = 100  # from which the features' mean and deviation are taken
+
+
+class GoalConditioned(Learner):
+    """A policy ``π(s, g)`` that reads :class:`~torchrl_caiac.modules.GoalFeatures`.
+
+    It needs the settings ``steps``, ``checkpoint_every``, ``batch_size``,
+    ``batches_at_once``, ``hidden_sizes`` and ``hidden_dtype``.
+    """
+
+    rb: ReplayBuffer
+    actor: GoalConditionedActor
+
+    def check_strides(self) -> None:
+        """Raises if a run could stop in the middle of a sample."""
+        settings = self.settings
+        for name in ("steps", "checkpoint_every"):
+            if settings[name] % settings.batches_at_once:
+                raise ValueError(
+                    f"learner.{name} is {settings[name]}, expected a multiple of "
+                    f"learner.batches_at_once, {settings.batches_at_once}: a run could "
+                    "not resume in the middle of a sample"
+                )
+
+    def start(self, rows: TensorDictBase, seed: int) -> GoalFeatures:
+        """Makes the buffer; returns features with the statistics of some batches.
+
+        All methods of a seed then create the same networks.
+        """
+        self.check_strides()
+        torch.manual_seed(seed)
+        self.rb = self.make_buffer(rows)
+        features = self.make_features()
+        # Before the networks are created: they copy it.
+        features.fit_statistics(
+            torch.cat(list(islice(self.batches(), _STATISTICS_BATCHES)))
+        )
+        torch.manual_seed(seed)
+        return features
+
+    def make_features(self) -> GoalFeatures:
+        """Creates the input of the networks, with relative positions and goals."""
+        return GoalFeatures(
+            self.environment.layout, reference=self.environment.goal_reference
+        )
+
+    def make_actor(
+        self, features: GoalFeatures, action_key: NestedKey = "action"
+    ) -> GoalConditionedActor:
+        """Returns the policy."""
+        return GoalConditionedActor(
+            features,
+            self.environment.action_dim,
+            tuple(self.settings.hidden_sizes),
+            hidden_dtype=self.hidden_dtype,
+            action_key=action_key,
+        )
+
+    @property
+    def hidden_dtype(self) -> torch.dtype | None:
+        """The dtype of the products of the hidden layers."""
+        name = self.settings.hidden_dtype
+        return None if name == "float32" else getattr(torch, name)
+
+    @property
+    def rows_at_once(self) -> int:
+        """The number of transitions in one sample."""
+        return int(self.settings.batch_size * self.settings.batches_at_once)
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Yields batches, several from one sample, which saves time."""
+        at_once = self.settings.batches_at_once
+        while True:
+            rows = self.rb.sample()
+            # In strides: the last rows of a sample, and so of each, are counterfactual.
+            yield from (rows[first::at_once] for first in range(at_once))
+
+    def policy_state(self) -> dict[str, Any]:
+        """Returns the state of the policy."""
+        return self.actor.state_dict()
+
+    def load_policy(self, state: dict[str, Any]) -> Any:
+        """Returns the policy."""
+        actor = self.make_actor(self.make_features())
+        actor.load_state_dict(state)
+        return actor.eval()
+
+
+def descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
+    """Takes one step of an optimizer."""
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()

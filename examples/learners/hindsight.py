@@ -1,0 +1,109 @@
+"""The buffer that learners of values sample: all rows, with goals in hindsight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers import RandomSampler, Storage
+
+from learners.goal_conditioned import GoalConditioned
+from torchrl_caiac.data import offline_buffer
+from torchrl_caiac.trajectories import trajectory_index
+from torchrl_caiac.transforms import HindsightGoal
+
+__all__ = ["HindsightLearner", "ShareSampler", "until_success"]
+
+
+def until_success(rows: TensorDictBase) -> torch.Tensor:
+    """Returns the rows of successful trajectories up to their first success.
+
+    Args:
+        rows (TensorDictBase): transitions ``[T]`` whose reward is 0 where the desired
+            goal is reached and negative elsewhere, one trajectory after another.
+
+    Returns:
+        torch.Tensor: bool ``[T]``.
+    """
+    success = rows["next", "reward"].reshape(-1) >= 0
+    index = trajectory_index(rows)
+    total = success.cumsum(0)
+    # Successes before the trajectory, and in the whole of it, for each row.
+    ends = total[index.ends]
+    before = torch.cat([ends.new_zeros(1), ends[:-1]])
+    solved = (ends > before).repeat_interleave(index.lengths)
+    earlier = total - success.long() - before.repeat_interleave(index.lengths)
+    return solved & (earlier == 0)
+
+
+class ShareSampler(RandomSampler):
+    """Draws rows of a part of the data with a probability, all rows otherwise.
+
+    Args:
+        part (torch.Tensor): bool ``[T]``, true for the rows of the part.
+        share (float): the probability of drawing from the part alone.
+    """
+
+    def __init__(self, part: torch.Tensor, share: float) -> None:
+        super().__init__()
+        self.share = share
+        self.rows = part.nonzero().flatten()
+        if not len(self.rows):
+            raise ValueError(
+                f"no row is of a successful episode, but learner.successful is {share}:"
+                " collect some, or set it to null"
+            )
+
+    def sample(
+        self, storage: Storage, batch_size: int
+    ) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Draws rows with replacement, in random order."""
+        anywhere, info = super().sample(storage, batch_size)
+        picked = self.rows[torch.randint(len(self.rows), (batch_size,))]
+        return torch.where(torch.rand(batch_size) < self.share, picked, anywhere), info
+
+
+class HindsightLearner(GoalConditioned):
+    """Learns values of rewards for goals, from all rows of the environment."""
+
+    extendable = True
+    reads = (
+        *GoalConditioned.reads,
+        *[("next", name) for name in ("reward", "terminated")],
+    )
+
+    def rows(self) -> TensorDictBase:
+        """Returns what learning reads, in memory."""
+        return self.read_leaves(self.environment.goal_rows())
+
+    def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
+        """Makes the buffer of transitions, counterfactuals, and hindsight goals.
+
+        Without augmentation there are as many random goals as counterfactuals would
+        have (A.5.2).
+        """
+        environment = self.environment
+        if environment.reward_fn is None:
+            raise ValueError(
+                f"learner={self.settings.name} needs rewards for goals, which "
+                f"{type(environment).__name__} does not have: set its reward_fn, or "
+                "choose another learner"
+            )
+        augmentation = self.counterfactuals()
+        ratio = self.augmentation.counterfactual_ratio
+        goals = HindsightGoal(
+            environment.layout,
+            environment.reward_fn,
+            random=0.5 * ratio if augmentation is None else 0.0,
+        )
+        options: dict[str, Any] = {}
+        share = self.settings.get("successful")
+        if share is not None:
+            options["sampler"] = ShareSampler(until_success(rows), share)
+        rb = offline_buffer(rows, self.rows_at_once, sample_unit=goals, **options)
+        if augmentation is not None:
+            rb.append_transform(augmentation)
+        rb.append_transform(goals)
+        return rb

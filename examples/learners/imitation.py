@@ -1,0 +1,71 @@
+"""The buffer that imitation learners sample."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.data import SliceSampler, TensorDictReplayBuffer
+
+from learners.base import Learner
+from torchrl_caiac.data import offline_buffer
+from torchrl_caiac.transforms import WindowGoal
+
+__all__ = ["has_own_goals", "imitation_buffer"]
+
+
+def has_own_goals(settings: DictConfig) -> bool:
+    """Returns whether rows keep their desired goals, ``goals: own``.
+
+    Raises:
+        ValueError: ``goals`` is neither ``own`` nor ``future``.
+    """
+    if settings.goals not in ("own", "future"):
+        raise ValueError(
+            f"learner.goals is {settings.goals!r}, expected 'own' (the desired goal of "
+            "the episode) or 'future' (later states of it, see learner.future_goals)"
+        )
+    return bool(settings.goals == "own")
+
+
+def imitation_buffer(
+    learner: Learner,
+    rows: TensorDictBase,
+    *,
+    batch_size: int,
+    window: int = 1,
+    goals: WindowGoal | None = None,
+) -> TensorDictReplayBuffer:
+    """Creates a buffer of demonstrations: windows, their goals, and counterfactuals.
+
+    Goals come before the counterfactuals, whose goals follow the swap: a swapped entity
+    takes the goal of its donor.
+
+    Args:
+        learner (Learner): has the method.
+        rows (TensorDictBase): demonstrations, ``[T]``.
+
+    Keyword Args:
+        batch_size (int): rows in a sample, a multiple of ``window``.
+        window (int): rows that follow each other. Defaults to 1.
+        goals (WindowGoal, optional): draws later states as goals. Defaults to
+            ``None``: the desired goals of the rows.
+
+    Returns:
+        TensorDictReplayBuffer: the buffer.
+    """
+    options: dict[str, Any] = {}
+    if window > 1:
+        options["sampler"] = SliceSampler(
+            slice_len=window, traj_key="episode", cache_values=True
+        )
+    if goals is not None:
+        options["sample_unit"] = goals
+    rb = offline_buffer(rows, batch_size, **options)
+    if goals is not None:
+        rb.append_transform(goals)
+    augmentation = learner.counterfactuals(window=window)
+    if augmentation is not None:
+        rb.append_transform(augmentation)
+    return rb

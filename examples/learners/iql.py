@@ -1,0 +1,98 @@
+"""Implicit Q-learning with hindsight goals."""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torchrl.modules import MLP, IndependentNormal
+from torchrl.objectives import IQLLoss, SoftUpdate
+
+from learners.goal_conditioned import descend
+from learners.hindsight import HindsightLearner
+from torchrl_caiac.modules import GoalConditionedCritic, GoalFeatures
+
+__all__ = ["IQL"]
+
+
+class IQL(HindsightLearner):
+    """IQL on stored transitions; needs an environment with rewards of goals.
+
+    The policy is a normal distribution of constant width around a bounded action: under
+    a squashed one, actions at their bounds, as experts prefer them, are infinitely
+    unlikely.
+    """
+
+    def setup(self, rows: TensorDictBase, seed: int) -> None:
+        """Makes policy, values and action values, with statistics of some batches."""
+        settings = self.settings
+        features = self.start(rows, seed)
+        self.actor = self.make_actor(features, "loc")
+        self.loss_module = IQLLoss(
+            self.make_distribution(),
+            [
+                GoalConditionedCritic(
+                    features,
+                    self.environment.action_dim,
+                    tuple(settings.hidden_sizes),
+                    hidden_dtype=self.hidden_dtype,
+                    layer_norm=settings.layer_norm,
+                )
+                for _ in range(2)
+            ],
+            self.make_value(features),
+            loss_function="l2",
+            temperature=settings.temperature,
+            expectile=settings.expectile,
+            deactivate_vmap=True,
+        )
+        self.loss_module.make_value_estimator(gamma=settings.gamma)
+        self.updater = SoftUpdate(self.loss_module, tau=settings.tau)
+        self.optimizer = torch.optim.Adam(
+            self.loss_module.parameters(), lr=settings.lr, fused=True
+        )
+        self.parts = {"loss": self.loss_module, "optimizer": self.optimizer}
+
+    def make_distribution(self) -> ProbabilisticTensorDictSequential:
+        """Returns the policy as a distribution of actions."""
+        deviation = self.settings.deviation
+        return ProbabilisticTensorDictSequential(
+            self.actor,
+            TensorDictModule(
+                lambda loc: torch.full_like(loc, deviation), ["loc"], ["scale"]
+            ),
+            ProbabilisticTensorDictModule(
+                ["loc", "scale"], ["action"], distribution_class=IndependentNormal
+            ),
+        )
+
+    def make_value(self, features: GoalFeatures) -> TensorDictSequential:
+        """Returns the value of a state and a goal."""
+        network = MLP(
+            features.width,
+            1,
+            num_cells=list(self.settings.hidden_sizes),
+            activation_class=torch.nn.ReLU,
+        )
+        return TensorDictSequential(
+            copy.deepcopy(features),
+            TensorDictModule(network, features.out_keys, ["state_value"]),
+        )
+
+    def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
+        """Takes one step of Adam, of all networks."""
+        # The next state has the goal of its transition.
+        batch["next", "desired_goal"] = batch["desired_goal"]
+        losses = self.loss_module(batch)
+        names = ("loss_actor", "loss_qvalue", "loss_value")
+        descend(self.optimizer, sum(losses[name] for name in names))
+        self.updater.step()
+        scalars = {name: losses[name].detach() for name in names}
+        return scalars | self.share_swapped(batch)

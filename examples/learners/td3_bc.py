@@ -1,0 +1,39 @@
+"""Offline TD3 with hindsight goals and a cloning term (TD3+BC)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from learners.hindsight import until_success
+from learners.td3 import TD3
+
+__all__ = ["TD3BC"]
+
+_NOT_CLONED = "not_cloned"
+
+
+class TD3BC(TD3):
+    """TD3 that repeats the actions of successful episodes up to their first success.
+
+    It repeats those of counterfactuals too: a swap leaves out what the action is for.
+    """
+
+    def rows(self) -> TensorDictBase:
+        """Returns what learning reads, and which actions are not repeated."""
+        rows = super().rows()
+        return rows.set(_NOT_CLONED, ~until_success(rows).unsqueeze(-1))
+
+    def loss_options(self) -> dict[str, Any]:
+        """Returns the arguments of the cloning term."""
+        return {"bc_alpha": self.settings.bc_alpha, "bc_mask_key": _NOT_CLONED}
+
+    def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
+        """Takes a step; actions do not explain goals that other rows achieve."""
+        unexplained = batch["hindsight", "relabeled"]
+        flags = batch.get(("caiac", "counterfactual"), None)
+        if flags is not None:
+            batch[_NOT_CLONED] = batch[_NOT_CLONED] | (flags & unexplained)
+        return super().step(batch, step)

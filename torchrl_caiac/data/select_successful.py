@@ -1,0 +1,163 @@
+"""The successful trajectories of a dataset, up to their first success."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+
+from torchrl_caiac._checks import check_int
+from torchrl_caiac._keys import get_leaf
+from torchrl_caiac._keys import path as key_path
+from torchrl_caiac.data.action_bounds import action_bounds
+from torchrl_caiac.data.write_transitions import check_free, write_transitions
+from torchrl_caiac.trajectories import trajectory_index
+
+__all__ = ["select_successful"]
+
+
+def select_successful(
+    data: TensorDictBase,
+    key: NestedKey = ("next", "success"),
+    *,
+    above: float | None = None,
+    cut: bool = True,
+    trajectories: int | None = None,
+    path: str | Path | None = None,
+    trajectory_key: NestedKey | None = "episode",
+    done_key: NestedKey | None = ("next", "done"),
+    overwrite: bool = False,
+) -> TensorDict:
+    """Returns the trajectories that succeed, up to their first success.
+
+    Imitation learners copy every row that they get. Episodes that fail, and what a
+    demonstrator does after it has succeeded, teach them what nobody wants.
+
+    With ``cut``, the last row that is kept ends its trajectory: ``done_key`` and the
+    entry ``"truncated"`` beside it, if present, become true there.
+
+    Args:
+        data (TensorDictBase): transitions ``[T]``. For the trajectories see
+            :func:`~torchrl_caiac.trajectories.trajectory_index`.
+        key (NestedKey): what says that a transition succeeds, ``[T]`` or ``[T, 1]``: a
+            flag, or with ``above`` a number such as the reward. Defaults to
+            ``("next", "success")``.
+
+    Keyword Args:
+        above (float, optional): a transition succeeds where the entry is above this
+            number. With rewards of -1, and 0 at the goal, that is ``-0.5``. Defaults to
+            ``None``: the entry is a flag, bool, or 0 and 1.
+        cut (bool): whether the rows after the first success are left out. Defaults to
+            ``True``.
+        trajectories (int, optional): how many successful trajectories to take, the
+            first ones in the order of time. Defaults to all of them.
+        path (str or Path, optional): the folder of a memory-mapped result, which has
+            digests; see :func:`~torchrl_caiac.data.write_transitions`. Defaults to
+            ``None``: in memory.
+        trajectory_key (NestedKey, optional): the trajectory ids; ``None`` to use the
+            end flags alone. Defaults to ``"episode"``.
+        done_key (NestedKey, optional): the end flags; ``None`` to use the ids alone.
+            Defaults to ``("next", "done")``.
+        overwrite (bool): whether to replace ``path`` if it exists. Defaults to
+            ``False``.
+
+    Returns:
+        TensorDict: the rows, trajectory by trajectory, ``[T']``, with the entries of
+        ``data``; locked if memory-mapped.
+
+    Raises:
+        FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
+        KeyError: the data lack ``key``, or ids and end flags.
+        ValueError: no trajectory succeeds, or fewer than ``trajectories``; or the entry
+            is not a flag and ``above`` is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.select_successful import select_successful
+        >>> reward = torch.tensor([-1.0, -1.0, -1.0, 0.0, 0.0])
+        >>> data = TensorDict(
+        ...     {"episode": torch.tensor([0, 0, 1, 1, 1]), ("next", "reward"): reward},
+        ...     [5],
+        ... )
+        >>> select_successful(data, ("next", "reward"), above=-0.5)["episode"]
+        tensor([1, 1])
+    """
+    check_free(path, overwrite)
+    index = trajectory_index(data, trajectory_key=trajectory_key, done_key=done_key)
+    rows = index.rows(torch.arange(len(data), device=index.device)).cpu()
+    successes = _successes(data, key, above)[rows]
+    lengths = index.lengths.cpu()
+    number = torch.arange(len(lengths)).repeat_interleave(lengths)
+    # For each row, the successes of its trajectory in earlier rows.
+    count = successes.long().cumsum(0)
+    before = torch.cat([count.new_zeros(1), count])[(index.ends.cpu() + 1) - lengths]
+    is_successful = count[index.ends.cpu()] > before
+    found = int(is_successful.sum())
+    if trajectories is not None:
+        check_int("trajectories", trajectories, 1)
+    if found < (trajectories or 1):
+        raise ValueError(
+            f"{found} of {len(lengths)} trajectories succeed according to {key!r}"
+            f"{'' if above is None else f' above {above:g}'}, wanted "
+            f"{trajectories or 'at least one'}: collect more, or correct key or above"
+        )
+    if trajectories is not None:
+        is_successful &= is_successful.cumsum(0) <= trajectories
+    kept = is_successful[number]
+    if cut:
+        earlier = count - successes.long() - before[number]
+        kept &= earlier == 0
+    chosen = data[rows[kept].to(data.device or "cpu")]
+    chosen = TensorDict(chosen.to_dict(), chosen.batch_size, device=chosen.device)
+    if cut:
+        _end(chosen, number[kept], done_key)
+    if path is None:
+        return chosen
+    bounds = action_bounds(data)
+    return write_transitions(chosen, path, overwrite=overwrite, action_bounds=bounds)
+
+
+def _successes(
+    data: TensorDictBase, key: NestedKey, above: float | None
+) -> torch.Tensor:
+    """Returns which rows succeed, bool ``[T]``."""
+    leaf = get_leaf(
+        data, key, "the transitions lack", "name the one they have with key="
+    )
+    if leaf.numel() != len(data):
+        raise ValueError(
+            f"{key!r} has shape {list(leaf.shape)}, expected [T] or [T, 1]: one value "
+            "for each transition"
+        )
+    leaf = leaf.as_subclass(torch.Tensor).reshape(-1).cpu()
+    if above is not None:
+        return leaf > above
+    if leaf.dtype is not torch.bool and not bool(((leaf == 0) | (leaf == 1)).all()):
+        raise ValueError(
+            f"{key!r} has values from {leaf.min():g} to {leaf.max():g}, expected a "
+            "flag, bool or 0 and 1: pass above=, the number that a successful "
+            "transition exceeds"
+        )
+    return leaf.bool()
+
+
+def _end(rows: TensorDict, number: torch.Tensor, done_key: NestedKey | None) -> None:
+    """Sets the end flags of the last row of each trajectory."""
+    last = torch.ones(len(number), dtype=torch.bool)
+    last[:-1] = number[1:] != number[:-1]
+    for key in () if done_key is None else (done_key, _beside(done_key, "truncated")):
+        flags = rows.get(key, None)
+        if flags is not None:
+            where = last.view(-1, *(1,) * (flags.ndim - 1)).to(flags.device)
+            rows.set(
+                key,
+                flags | where if flags.dtype is torch.bool else flags.where(~where, 1),
+            )
+
+
+def _beside(key: NestedKey, name: str) -> NestedKey:
+    parents = key_path(key)[:-1]
+    return (*parents, name) if parents else name

@@ -1,0 +1,296 @@
+"""Influence later in the trajectory: which entities a row's action is meant for."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import ReplayBuffer, TensorStorage
+
+from torchrl_caiac._torchrl import storage_revision, storage_rows
+from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.score_leaf import valid_scores
+from torchrl_caiac.influence.score_record import read_record
+from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows, trajectory_index
+from torchrl_caiac.transforms.checks import LateCheck
+from torchrl_caiac.transforms.indexing import pick_rows, plain_tensor
+from torchrl_caiac.transforms.keys import TransformKeys
+
+__all__ = [
+    "NEVER",
+    "Lookahead",
+    "LookaheadArgument",
+    "check_lookahead",
+    "hold_entities",
+    "locked_entities",
+    "steps_to_influence",
+]
+
+LookaheadArgument = int | Literal["next"] | None
+
+#: The number of steps of an entity that is not influenced any more in its trajectory.
+NEVER = 2**31 - 1
+
+# Rows whose scores are compared with the threshold together.
+_CHUNK = 1 << 20
+_BUILDING = threading.Lock()  # batches may be prefetched by several threads
+
+
+def check_lookahead(lookahead: object) -> LookaheadArgument:
+    """Returns a valid lookahead, or raises.
+
+    Args:
+        lookahead (object): the argument of a transform.
+
+    Returns:
+        int, str or None: the lookahead.
+
+    Raises:
+        TypeError: it is neither an int, ``"next"`` nor ``None``.
+        ValueError: it is negative.
+
+    Examples:
+        >>> from torchrl_caiac.transforms.lookahead import check_lookahead
+        >>> check_lookahead("next")
+        'next'
+    """
+    if lookahead is None or (isinstance(lookahead, str) and lookahead == "next"):
+        return lookahead  # type: ignore[return-value]
+    if isinstance(lookahead, bool) or not isinstance(lookahead, int):
+        raise TypeError(
+            f"lookahead must be a number of steps, 'next' or None, got {lookahead!r}"
+        )
+    if lookahead < 0:
+        raise ValueError(f"lookahead is {lookahead}, expected at least 0")
+    return lookahead
+
+
+def steps_to_influence(
+    influenced: torch.Tensor, trajectories: TrajectoryIndex
+) -> torch.Tensor:
+    """Returns the number of steps to the next row in which each entity is influenced.
+
+    Args:
+        influenced (torch.Tensor): bool ``[T, N]``, in the order of the storage.
+        trajectories (TrajectoryIndex): the trajectories of the same rows.
+
+    Returns:
+        torch.Tensor: int32 ``[T, N]``, 0 where the entity is influenced in the row
+        itself, :data:`NEVER` where it is influenced in no later row of the trajectory.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.trajectories import trajectory_index
+        >>> from torchrl_caiac.transforms.lookahead import steps_to_influence
+        >>> index = trajectory_index(TensorDict({"episode": torch.zeros(4)}, [4]))
+        >>> influenced = torch.tensor([[False], [False], [True], [False]])
+        >>> steps_to_influence(influenced, index).flatten().tolist()
+        [2, 1, 0, 2147483647]
+    """
+    length, device = trajectories.length, influenced.device
+    position = torch.arange(length, dtype=torch.int32, device=device)
+    rows = trajectories.rows(position.long().to(trajectories.device))
+    # The place of the last row of each row's trajectory, in the order of time.
+    last = position + trajectories.remaining(rows).to(device, torch.int32)
+    rows = rows.to(device)
+    steps = torch.empty(influenced.shape, dtype=torch.int32, device=device)
+    for entity in range(influenced.shape[1]):
+        here = influenced[:, entity].index_select(0, rows)
+        later = position.where(here, NEVER).flip(0).cummin(0).values.flip(0)
+        found = (later - position).where(later <= last, NEVER)
+        steps[:, entity].index_copy_(0, rows, found)
+    return steps
+
+
+def locked_entities(
+    steps: torch.Tensor, rule: int | Literal["next"], competing: torch.Tensor
+) -> torch.Tensor:
+    """Returns the entities that must stay, since the action is meant for them.
+
+    Args:
+        steps (torch.Tensor): from :func:`steps_to_influence`, ``[T, N]``.
+        rule (int or str): a number of steps: what is influenced within it. ``"next"``:
+            what is influenced now, or else what is influenced next.
+        competing (torch.Tensor): bool ``[N]``, the entities that can be the next one.
+
+    Returns:
+        torch.Tensor: bool ``[T, N]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.lookahead import NEVER, locked_entities
+        >>> steps = torch.tensor([[4, 9], [0, 5], [NEVER, NEVER]])
+        >>> locked_entities(steps, "next", torch.tensor([True, True]))
+        tensor([[ True, False],
+                [ True, False],
+                [False, False]])
+        >>> locked_entities(steps, 4, torch.tensor([True, True]))
+        tensor([[ True, False],
+                [ True, False],
+                [False, False]])
+    """
+    if rule != "next":
+        return steps <= rule
+    first = steps.where(competing, NEVER).amin(-1, keepdim=True)
+    return (steps == 0) | ((steps == first) & (first < NEVER))
+
+
+def hold_entities(scores: torch.Tensor, locked: torch.Tensor) -> torch.Tensor:
+    """Returns scores in which locked entities count as influenced.
+
+    Args:
+        scores (torch.Tensor): ``[n, N]``, or graphs ``[n, N + 1, N]``; they are not
+            changed.
+        locked (torch.Tensor): bool ``[n, N]``.
+
+    Returns:
+        torch.Tensor: the scores, or graphs in which the action is linked to the locked
+        entities.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.lookahead import hold_entities
+        >>> hold_entities(torch.zeros(1, 2), torch.tensor([[True, False]])) > 1
+        tensor([[ True, False]])
+    """
+    influenced = torch.finfo(scores.dtype).max
+    if scores.ndim == 2:
+        return scores.masked_fill(locked, influenced)
+    held = scores.clone()
+    held[:, -1].masked_fill_(locked, influenced)
+    return held
+
+
+class Lookahead:
+    """The entities that stored rows lock, computed when their buffer is first sampled.
+
+    The table has one byte for each row and entity. It is built again after each write
+    to the storage. A row whose score is missing, or that of another state, counts as
+    influenced.
+
+    Args:
+        rule (int or str): see :func:`locked_entities`.
+        layout (EntityLayout): the entities.
+
+    Keyword Args:
+        score_key (NestedKey): the scores.
+        keys (TransformKeys): trajectory ids and end flags.
+        free (callable): maps the scores of rows, ``[n, ...]``, to bool ``[n, N]``, the
+            entities that may be swapped in these rows.
+        competing (callable): returns the entities that can be the next one, ``[N]``.
+    """
+
+    def __init__(
+        self,
+        rule: int | Literal["next"],
+        layout: EntityLayout,
+        *,
+        score_key: NestedKey,
+        keys: TransformKeys,
+        free: Callable[[torch.Tensor], torch.Tensor],
+        competing: Callable[[], torch.Tensor],
+    ) -> None:
+        self.rule: int | Literal["next"] = rule
+        self.layout = layout
+        self.score_key = score_key
+        self.keys = keys
+        self._free = free
+        self._competing = competing
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Drops the tables, so that they are built again."""
+        self._tables: weakref.WeakKeyDictionary[Any, tuple[Any, torch.Tensor]] = (
+            weakref.WeakKeyDictionary()
+        )
+
+    def table(self, source: ReplayBuffer | TensorStorage) -> torch.Tensor:
+        """Returns what each row of a buffer locks.
+
+        Args:
+            source (ReplayBuffer or TensorStorage): the buffer, or its storage.
+
+        Returns:
+            torch.Tensor: bool ``[T, N]``.
+
+        Raises:
+            KeyError: trajectory ids and end flags are missing.
+            TypeError: the storage does not contain a tensordict.
+            ValueError: the scores look further ahead than the rule.
+        """
+        storage = source.storage if isinstance(source, ReplayBuffer) else source
+        data = storage_rows(storage, "the storage of the buffer that samples")
+        with _BUILDING:
+            revision = storage_revision(storage)
+            built = self._tables.get(storage)
+            if built is None or built[0] != revision:
+                built = revision, self._build(source, storage, data)
+                self._tables[storage] = built
+            return built[1]
+
+    def _build(
+        self,
+        source: ReplayBuffer | TensorStorage,
+        storage: TensorStorage,
+        data: TensorDictBase,
+    ) -> torch.Tensor:
+        scores = valid_scores(data, self.score_key, self.layout, len(storage))
+        record = read_record(storage, data, self.score_key)
+        own = 0 if record is None else int(record["settings"]["lookahead"])
+        if self.rule != "next" and self.rule < own:
+            raise ValueError(
+                f"lookahead is {self.rule}, but the scores in {self.score_key!r} "
+                f"contain those of {own} later states: pass at least lookahead={own}, "
+                "or score with score_buffer(..., lookahead=0)"
+            )
+        trajectories = trajectory_index(
+            source, trajectory_key=self.keys.trajectory, done_key=self.keys.done
+        )
+        influenced = torch.cat([~self._free(part) for part in scores.split(_CHUNK)])
+        steps = steps_to_influence(influenced, trajectories)
+        steps += own * ((steps > 0) & (steps < NEVER))
+        return locked_entities(steps, self.rule, self._competing().to(steps.device))
+
+    def locked(
+        self, source: ReplayBuffer, index: Any, scores: torch.Tensor
+    ) -> torch.Tensor:
+        """Returns what the rows of a batch lock.
+
+        Args:
+            source (ReplayBuffer): the buffer that samples.
+            index (torch.Tensor or tuple): the rows that it drew.
+            scores (torch.Tensor): the scores of the batch, ``[B, ...]``.
+
+        Returns:
+            torch.Tensor: bool ``[B, N]``.
+
+        Raises:
+            RuntimeError: the batch does not consist of these rows.
+        """
+        table, storage = self.table(source), source.storage
+        rows = flat_rows(index, storage)
+        same = len(rows) == len(scores)
+        if same and not LateCheck.needed(scores.device):
+            stored = plain_tensor(storage_rows(storage).get(self.score_key))
+            stored = pick_rows(stored, rows).to(scores.device)
+            same = torch.equal(stored.nan_to_num(), scores.nan_to_num())
+        if not same:
+            raise RuntimeError(
+                "the batch does not have the rows that the buffer drew, so that the "
+                "trajectories of its rows are unknown: append this transform before "
+                "others that select, repeat or reorder rows, or leave out lookahead"
+            )
+        return pick_rows(table, rows).to(scores.device)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: self.__dict__[key] for key in self.__dict__ if key != "_tables"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.refresh()
