@@ -23,7 +23,10 @@ from torchrl_caiac.envs.kitchen import (
     DEMONSTRATIONS_ID,
     KITCHEN_TASKS,
     MICROWAVE_KETTLE,
+    PLAY_ANY_START_ID,
+    PLAY_ANY_START_ORDERS,
     PLAY_ID,
+    PLAY_ORDERS,
     RANDOM_ID,
     KitchenEnv,
     create_kitchen_demonstrations,
@@ -39,6 +42,11 @@ from torchrl_caiac.trajectories import trajectory_index
 __all__ = ["HandleDistance", "Kitchen"]
 
 LAYOUT = KitchenEnv.layout
+# Names, orders and longest attempts of the chains, by ``env.collect.chains``.
+CHAINS = {
+    "play": (PLAY_ID, PLAY_ORDERS, 400),
+    "play_any_start": (PLAY_ANY_START_ID, PLAY_ANY_START_ORDERS, 440),
+}
 
 
 class Kitchen(Environment):
@@ -67,7 +75,13 @@ class Kitchen(Environment):
             "overwrite": True,
             "progress": progress,
         }
-        demonstrations = PLAY_ID if settings.chains else DEMONSTRATIONS_ID
+        chains = settings.chains
+        if chains not in (None, *CHAINS):
+            raise ValueError(
+                f"env.collect.chains is {chains!r}, expected null, for single tasks, "
+                f"or one of {list(CHAINS)}"
+            )
+        demonstrations = DEMONSTRATIONS_ID if chains is None else CHAINS[chains][0]
         for name, dataset_id, episodes, seed in (
             ("demonstrations", demonstrations, settings.episodes, settings.seed),
             ("held_out", "kitchen/held-out-v0", settings.held_out, settings.seed + 1),
@@ -89,9 +103,16 @@ class Kitchen(Environment):
         self, dataset_id: str, episodes: int, seed: int, options: dict[str, Any]
     ) -> MinariDataset:
         """Collects this number of demonstrations of each task, or chain of tasks."""
-        if self.settings.collect.chains:
+        chains = self.settings.collect.chains
+        if chains is not None:
+            _, orders, max_steps = CHAINS[chains]
             return create_kitchen_play(
-                dataset_id, episodes=episodes, seed=seed, **options
+                dataset_id,
+                orders=orders,
+                episodes=episodes,
+                max_steps=max_steps,
+                seed=seed,
+                **options,
             )[0]
         groups = [dataclasses.replace(g, episodes=episodes) for g in MICROWAVE_KETTLE]
         return create_kitchen_demonstrations(
