@@ -231,39 +231,6 @@ class OGBench(Environment):
             )
         return results
 
-    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns one line for each task."""
-        return self.measures(evaluation.episodes)
-
-    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Returns the success in each task, by run."""
-        tasks = dict.fromkeys(e["task"] for v in evaluations for e in v.episodes)
-        return {
-            task: [
-                float(np.mean([e["success"] for e in v.episodes if e["task"] == task]))
-                for v in evaluations
-            ]
-            for task in tasks
-        }
-
-    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Returns the success of each method by task."""
-        lines = []
-        for method in dict.fromkeys(e.method for e in evaluations):
-            mine = [e for e in evaluations if e.method == method]
-            shares = [f"{k} {np.mean(v):.2f}" for k, v in self.bars(mine).items()]
-            lines.append(f"  {method:<14}" + ", ".join(shares))
-        return lines
-
-    def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the success over all tasks."""
-        shares = {}
-        for method in dict.fromkeys(e.method for e in evaluations):
-            mine = [e.episodes for e in evaluations if e.method == method]
-            solved = [episode["success"] for episodes in mine for episode in episodes]
-            shares[method] = f"{sum(solved)}/{len(solved)}"
-        return f"OGBench's tasks: {compare_methods(shares)}"
-
 
 class HandleDistance:
     """The rule of distance, between the hand and where entities are taken hold of.
