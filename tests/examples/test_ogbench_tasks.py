@@ -175,9 +175,9 @@ def test_goals_are_positions_of_the_cubes(steps, cfg):
 
 
 def test_learners_of_values_sample_all_episodes(steps, compose, cfg):
-    cfg = compose(
-        "env=ogbench_cube_double_noisy", "learner=iql", "method=[none]", out=cfg.out
-    )
+    small = {"out": cfg.out, "env": cfg.env}
+    whole = compose("env=ogbench_cube_double_noisy", "learner=iql", "method=[none]")
+    cfg = OmegaConf.merge(whole, small)
     with pytest.raises(ValueError, match=r"learner.successful is 0.7.*null"):
         made = steps.parts.make_learner(cfg, "none")
         made.make_buffer(made.rows())
