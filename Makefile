@@ -69,7 +69,7 @@ influence: setup ## compare influence estimators (QUICK=1: a smoke run)
 	@for env in fetch_push kitchen kitchen_all_tasks; do \
 	    $(BIN)/python examples/compare_influence.py env=$$env \
 	        publish=$(INFLUENCE) $(SIZE); done
-	@for env in fetch_push_sliding ogbench_cube_double; do \
+	@for env in fetch_push_sliding ogbench_cube_double ogbench_scene; do \
 	    $(BIN)/python examples/compare_influence.py env=$$env \
 	        'method=[caiac,distance_action,motion,residual,oracle]' \
 	        publish=$(INFLUENCE) $(SIZE); done

@@ -138,7 +138,9 @@ class Results:
         for row in self.rows:
             mine = row["setting"], row["learner"], row["method"]
             if mine == group and row["measure"] == measure:
-                cells.setdefault(int(row["seed"]), {})[row["task"]] = float(row["value"])
+                cells.setdefault(int(row["seed"]), {})[row["task"]] = float(
+                    row["value"]
+                )
         return {
             seed: [cells[seed][task] for task in tasks]
             for seed in sorted(cells)
@@ -171,13 +173,17 @@ def report_study(study: Study, runs: Sequence[Run], folder: Path) -> list[str]:
     """Writes the tables of a study to ``<folder>/<name>.md``, and returns the lines."""
     results = Results.read(study, runs, folder)
     lines = _table(results)
-    tasks = {s: results.tasks(s, m) for s in study.settings for m in results.measures[:1]}
+    tasks = {
+        s: results.tasks(s, m) for s in study.settings for m in results.measures[:1]
+    }
     if any(len(names) > 1 for names in tasks.values()):
         lines += ["", *_task_table(results, tasks)]
     done = {tuple(row.values())[:4] for row in results.rows}
     missing = len(runs) - len(done)
-    ended = f"All {len(runs)} runs are done." if not missing else (
-        f"{missing} of {len(runs)} runs are missing."
+    ended = (
+        f"All {len(runs)} runs are done."
+        if not missing
+        else (f"{missing} of {len(runs)} runs are missing.")
     )
     lines += ["", ended]
     with whole_file(folder / f"{study.name}.md") as partial:

@@ -116,7 +116,9 @@ def read_arguments(arguments: Sequence[str]) -> Options:
         else:
             overrides.append(argument)
     only = {
-        name: [str(v) for v in (own[name] if isinstance(own[name], list) else [own[name]])]
+        name: [
+            str(v) for v in (own[name] if isinstance(own[name], list) else [own[name]])
+        ]
         for name in _FILTERS
         if name in own
     }

@@ -148,7 +148,10 @@ class Study:
         protocol = [
             f"validation.policies={_null(self.validation.get('policies'))}",
         ]
-        for key, part in (("validation_episodes", self.validation), ("episodes", self.test)):
+        for key, part in (
+            ("validation_episodes", self.validation),
+            ("episodes", self.test),
+        ):
             if part.get("episodes") is not None:
                 protocol.append(f"env.evaluate.{key}={part['episodes']}")
         cfg = compose(
@@ -334,7 +337,10 @@ def _read_study(content: Any) -> Study:
         arms.append(arm)
     _check_names("answer", content["answer"], Answer)
     answer = Answer(**{k: str(v) for k, v in content["answer"].items()})
-    for name, known in (("validation", ("policies", "episodes")), ("test", ("episodes",))):
+    for name, known in (
+        ("validation", ("policies", "episodes")),
+        ("test", ("episodes",)),
+    ):
         part = _mapping(name, content.get(name, {}))
         for key, value in part.items():
             if key not in known:
