@@ -1,6 +1,6 @@
 """Evaluates the saved policies of a run.
 
-Run after ``train.py``: ``python evaluate.py method=caiac seed=0``. Every policy that was
+Run after ``train.py``: ``python evaluate.py method=caiac seed=0``. Every policy that is
 kept plays from validation starts. The best one plays from the test starts, whose
 results are those of the run.
 """
