@@ -14,10 +14,11 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study")
+SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study", "figures")
 SCRIPTS += ("compare_influence", "compare_precision")
 SCRIPTS += ("suggest_thresholds", "sweep_variance_floor")
-SHARED = ("console", "log", "parts", "settings", "tables", "thresholds")
+SHARED = ("console", "log", "parts", "results", "settings", "studies", "tables")
+SHARED += ("thresholds",)
 SMALL_ENV = {
     "kitchen": {
         "collect": {"episodes": 2, "held_out": 1},
