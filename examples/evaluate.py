@@ -16,7 +16,8 @@ import hydra
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from environments.base import Evaluation, Split
+from environments.base import Evaluation
+from environments.playing import Split
 from shared.console import progress_bar, start
 from shared.parts import candidates, make_environment, policy_file, run_folder
 from shared.settings import keep_settings
@@ -61,6 +62,7 @@ def play(
     environment = make_environment(cfg)
     folder = run_folder(cfg, method, seed) / cfg.evaluations
     kept: dict[str, Any] = OmegaConf.to_container(cfg.env.evaluate)
+    kept.pop("strips", None)  # figures
     kept["collect"] = OmegaConf.to_container(cfg.env.collect)  # has lengths of episodes
     keep_settings(folder, "evaluate", kept)
     check_run(cfg, method, seed)

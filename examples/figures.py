@@ -8,6 +8,7 @@ are rliable's: 95 %, by a bootstrap over seeds that is stratified by task.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ class Estimate(NamedTuple):
 
     Attributes:
         mean (float): over seeds and tasks.
-        low (float): the lower end.
+        low (float): the lower end; NaN with one seed, which has no interval.
         high (float): the upper end.
     """
 
@@ -43,23 +44,21 @@ class Estimate(NamedTuple):
     high: float
 
     def text(self, form: str = ".2f") -> str:
-        """Returns ``mean [low, high]``."""
+        """Returns ``mean [low, high]``, or the mean alone."""
+        if math.isnan(self.low):
+            return f"{self.mean:{form}}"
         return f"{self.mean:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
 def estimate(values: np.ndarray) -> Estimate:
-    """Returns the mean of values ``[seeds, tasks]`` and rliable's interval.
-
-    One seed, or seeds that are all equal, have an interval of no width.
-    """
+    """Returns the mean of values ``[seeds, tasks]`` and rliable's interval."""
     from rliable.library import get_interval_estimates
 
     def mean(x: np.ndarray) -> np.ndarray:
         return np.array([x.mean()])
 
-    if (values == values[:1]).all():
-        only = float(values.mean())
-        return Estimate(only, only, only)
+    if len(values) == 1:
+        return Estimate(float(values.mean()), math.nan, math.nan)
     state = np.random.get_state()
     try:
         np.random.seed(0)  # rliable draws from the global generator

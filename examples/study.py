@@ -169,8 +169,9 @@ def prepare(cfg: DictConfig, console: Console | None = None) -> None:
     with claim_when_free(environment.out), stage(environment.data_name):
         if not done.exists():
             collect(cfg)
-            # Here, since several folders may share the held-out rows.
-            environment.ground_truth()
+            if "caiac" in cfg.method:
+                # Here, since several folders may share the held-out rows.
+                environment.ground_truth()
     with claim_when_free(environment.folder):
         with stage("world model"):
             if not done.exists():
@@ -187,7 +188,8 @@ def _preparation(cfg: DictConfig) -> dict[str, Any]:
     for name in ("evaluate", "augmentation"):
         env.pop(name)
     methods = OmegaConf.to_container(cfg.method, resolve=True)
-    return {"env": env, "methods": methods}
+    # The learner decides which rows are scored.
+    return {"env": env, "methods": methods, "learner": cfg.learner.name}
 
 
 @contextmanager
@@ -294,8 +296,8 @@ def preparations(runs: Sequence[Run]) -> list[DictConfig]:
     """Returns the configurations that runs need prepared, with all of their methods."""
     by_data: dict[str, DictConfig] = {}
     for run in runs:
-        env = _preparation(run.cfg)["env"]
-        found = by_data.setdefault(digest(env), run.cfg.copy())
+        needs = {**_preparation(run.cfg), "methods": None}
+        found = by_data.setdefault(digest(needs), run.cfg.copy())
         found.method = OmegaConf.merge(found.method, run.cfg.method)
     return list(by_data.values())
 

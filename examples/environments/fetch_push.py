@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDictBase
 
-from environments.base import Environment, Evaluation, compare_methods
+from environments.base import Environment
 from environments.playing import Split, play_together
 from torchrl_caiac.data import (
     load_minari,
@@ -28,7 +28,6 @@ from torchrl_caiac.envs.fetch_push import (
     fetch_push_reward,
 )
 from torchrl_caiac.influence import DistanceInfluence, SimulatorInfluence
-from torchrl_caiac.plotting import bootstrap_interval
 
 __all__ = ["FetchPush"]
 
@@ -187,57 +186,6 @@ class FetchPush(Environment):
             for name in MEASURES
         ]
 
-    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns one line for each policy: the shares of its episodes."""
-        return [{name: _mean(evaluation, name) for name in MEASURES}]
-
-    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Returns mean success of each run, by the fraction of the data."""
-        return {
-            f"{100 * fraction:g} % of the data": _by_seed(
-                [e for e in evaluations if e.fraction == fraction], "full"
-            )
-            for fraction in dict.fromkeys(e.fraction for e in evaluations)
-        }
-
-    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Returns success by method, and CAIAC's difference to the others."""
-        steps = sorted({e.step for e in evaluations})
-        lines = [
-            f"success in {self.settings.evaluate.episodes} episodes, mean of the "
-            f"policies from step {steps[0]} to {steps[-1]}, 95 % interval over seeds",
-            f"  {'':<14}" + "".join(f"{name:>22}" for name in MEASURES),
-        ]
-        by_method = _by_method(evaluations)
-        for method, mine in by_method.items():
-            cells = []
-            for measure in MEASURES:
-                values = _by_seed(mine, measure)
-                low, high = bootstrap_interval(values)
-                cells.append(f"{np.mean(values):.3f} [{low:.3f}, {high:.3f}]")
-            lines.append(f"  {method:<14}" + "".join(f"{cell:>22}" for cell in cells))
-        if "caiac" in by_method and len(by_method) > 1:
-            lines += [
-                "",
-                "full success of caiac minus that of, 95 % interval over starts",
-            ]
-            own = _by_start(by_method.pop("caiac"))
-            for method, mine in by_method.items():
-                difference = own - _by_start(mine)
-                low, high = bootstrap_interval(difference)
-                lines.append(
-                    f"  {method:<14}{difference.mean():>+7.3f} [{low:.3f}, {high:.3f}]"
-                )
-        return lines
-
-    def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the share of episodes in which both cubes reach their goals."""
-        shares = {
-            method: f"{100 * np.mean(_by_seed(mine, 'full')):.1f} %"
-            for method, mine in _by_method(evaluations).items()
-        }
-        return f"both cubes at their goals: {compare_methods(shares)}"
-
 
 def play(
     actor: Any, *, episodes: int, steps: int, seed: int, **cubes: float
@@ -269,28 +217,3 @@ def play(
         {"full": bool(all_), "cube0": bool(first), "cube1": bool(second)}
         for all_, (first, second) in zip(full, reached, strict=True)
     ]
-
-
-def _mean(evaluation: Evaluation, measure: str) -> float:
-    return float(np.mean([episode[measure] for episode in evaluation.episodes]))
-
-
-def _by_method(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
-    grouped: dict[str, list[Evaluation]] = {}
-    for evaluation in evaluations:
-        grouped.setdefault(evaluation.method, []).append(evaluation)
-    return grouped
-
-
-def _by_seed(evaluations: Sequence[Evaluation], measure: str) -> list[float]:
-    """Returns means over the policies of each run."""
-    return [
-        float(np.mean([_mean(e, measure) for e in evaluations if e.seed == seed]))
-        for seed in sorted({e.seed for e in evaluations})
-    ]
-
-
-def _by_start(evaluations: Sequence[Evaluation]) -> np.ndarray:
-    """Returns full success from each start, mean over seeds and policies."""
-    played = [[episode["full"] for episode in e.episodes] for e in evaluations]
-    return np.mean(played, axis=0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import gc
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import torch
 from minari import MinariDataset
 from tensordict import TensorDict, TensorDictBase
 
-from environments.base import Environment, Evaluation, compare_methods
+from environments.base import Environment
 from environments.playing import Split, play_together
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.data import load_transitions
@@ -36,7 +35,7 @@ from torchrl_caiac.envs.kitchen import (
     kitchen_transitions,
 )
 from torchrl_caiac.influence import DistanceInfluence, SimulatorInfluence
-from torchrl_caiac.plotting import bootstrap_interval, plot_frames, plot_influence
+from torchrl_caiac.plotting import plot_frames, plot_influence
 from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = ["HandleDistance", "Kitchen"]
@@ -205,54 +204,6 @@ class Kitchen(Environment):
                 for measure in ("success", "task_success")
             ]
         return rows
-
-    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns one line for each episode."""
-        return [
-            {**episode, "wrong_tasks": " ".join(episode["wrong_tasks"])}
-            for episode in evaluation.episodes
-        ]
-
-    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Returns success of all episodes, by task."""
-        return {
-            task: [float(e["success"]) for e in _of_task(evaluations, task)]
-            for task in self.settings.evaluate.tasks
-        }
-
-    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Returns success by method and task, and which wrong tasks were done."""
-        lines = [
-            "success over all objects, 95 % interval over episodes; over the task's own"
-        ]
-        for method, task in product(
-            _methods(evaluations), self.settings.evaluate.tasks
-        ):
-            mine = _of_task(evaluations, task, method)
-            solved = [float(e["success"]) for e in mine]
-            low, high = bootstrap_interval(solved)
-            wrong = {
-                name: count
-                for name in KITCHEN_TASKS
-                if (count := sum(name in e["wrong_tasks"] for e in mine))
-            }
-            lines.append(
-                f"  {method:<13}{task:<15}{sum(solved) / len(solved):>6.2f} "
-                f"[{low:.2f}, {high:.2f}] of {len(mine)}; "
-                f"{sum(e['task_success'] for e in mine) / len(mine):.2f}   "
-                "wrong tasks done: "
-                + (", ".join(f"{name} {n}" for name, n in wrong.items()) or "none")
-            )
-        return lines
-
-    def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the solved episodes of the study's task, or of all tasks."""
-        question = self.settings.answer
-        shares = {}
-        for method in _methods(evaluations):
-            mine = _of_task(evaluations, question.task, method)
-            shares[method] = f"{sum(e['success'] for e in mine)}/{len(mine)}"
-        return f"{question.text}: {compare_methods(shares)}"
 
     def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
         """Draws the influence along a demonstration, and counterfactual frames."""
@@ -424,20 +375,3 @@ def close(kitchens: list[KitchenEnv]) -> None:
         kitchen.close()
     kitchens.clear()
     gc.collect()
-
-
-def _methods(evaluations: Sequence[Evaluation]) -> list[str]:
-    return list(dict.fromkeys(evaluation.method for evaluation in evaluations))
-
-
-def _of_task(
-    evaluations: Sequence[Evaluation], task: str | None, method: str | None = None
-) -> list[dict[str, Any]]:
-    """Returns the episodes of a task and a method; ``None`` for all."""
-    return [
-        episode
-        for evaluation in evaluations
-        if method in (None, evaluation.method)
-        for episode in evaluation.episodes
-        if task in (None, episode["task"])
-    ]

@@ -152,10 +152,10 @@ class Study:
             if part.get("episodes") is not None:
                 protocol.append(f"env.evaluate.{key}={part['episodes']}")
         cfg = compose(
+            *protocol,  # settings and arms may have others
             *self.settings[setting],
             f"learner={arm.learner}",
             f"method=[{','.join(arm.methods)}]",
-            *protocol,
             *arm.overrides,
             *self.overrides,
         )
@@ -166,7 +166,7 @@ class Study:
             mine.runs = f"runs/{arm.learner}-{digest(made_with)}"
             evaluated = {
                 "steps": mine.learner.steps,
-                "evaluate": mine.env.evaluate,
+                "evaluate": {**mine.env.evaluate, "strips": None},
                 "validation": mine.validation,
             }
             mine.evaluations = f"evaluation-{digest(evaluated)}"
@@ -221,7 +221,7 @@ def run_settings(cfg: DictConfig, method: str) -> dict[str, Any]:
     """
     made = make_method(cfg, method)
     env: dict[str, Any] = OmegaConf.to_container(cfg.env, resolve=True)
-    unused = {*_SHOWN, *_MODELS, "evaluate", "residual", "score", "truth", "answer"}
+    unused = {*_SHOWN, *_MODELS, "evaluate", "residual", "score", "truth"}
     unused -= {*made.models, *made.env_settings}
     if made.score_key is not None:
         unused.discard("score")

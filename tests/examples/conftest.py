@@ -44,6 +44,12 @@ SMALL_ENV = {
     },
 }
 SMALL_ENV["kitchen_all_tasks"] = SMALL_ENV["kitchen"]
+SMALL_ENV["ogbench_scene"] = SMALL_ENV["ogbench_cube_double"]
+SMALL_ENV["ogbench_cube_double_play"] = SMALL_ENV["ogbench_cube_double"] | {
+    "demonstrations": 2,
+    "evaluate": {"episodes": 2, "validation": {"episodes": 1}},
+}
+SMALL_ENV["ogbench_cube_double_noisy"] = SMALL_ENV["ogbench_cube_double_play"]
 SMALL_LEARNER = {
     "lmp": {
         "steps": 12,
