@@ -65,6 +65,10 @@ demo: setup ## the motivating experiment in the kitchen (QUICK=1: a smoke run)
 fetch-push: setup ## the comparison of methods on Fetch-Push (QUICK=1: a smoke run)
 	@$(BIN)/python examples/study.py study=fetch_push $(SIZE)
 
+.PHONY: watch
+watch: setup ## film two agents of a study side by side (STUDY=demo)
+	@$(BIN)/python examples/watch.py study=$(or $(STUDY),demo) $(SIZE)
+
 influence: setup ## compare influence estimators (QUICK=1: a smoke run)
 	@for env in fetch_push kitchen kitchen_all_tasks; do \
 	    $(BIN)/python examples/compare_influence.py env=$$env \
