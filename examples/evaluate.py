@@ -1,6 +1,6 @@
 """Evaluates the saved policies of a run.
 
-Run after ``train.py``: ``python evaluate.py method=caiac seed=0``. Every policy that was
+Run after ``train.py``: ``python evaluate.py method=caiac seed=0``. Every policy that is
 kept plays from validation starts. The best one plays from the test starts, whose
 results are those of the run.
 """
@@ -34,8 +34,8 @@ def evaluate(cfg: DictConfig, method: str, seed: int) -> Iterator[Evaluation]:
     A run with one policy has nothing to choose, and is not validated. Of policies that
     are equally good, the last one counts.
 
-    The results are saved in ``<evaluations>/<split>-<step>.json``; existing ones are not
-    repeated. They are refused if the run, or the policy, is another one by now.
+    The episodes are saved in ``<split>-<step>.json``; existing ones are not repeated.
+    They are refused if the run, or the policy, is another one by now.
 
     Yields:
         Evaluation: the last one has the split ``"test"``.

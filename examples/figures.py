@@ -52,23 +52,29 @@ class Estimate(NamedTuple):
 
 def estimate(values: np.ndarray) -> Estimate:
     """Returns the mean of values ``[seeds, tasks]`` and rliable's interval."""
-    from rliable.library import get_interval_estimates
-
-    def mean(x: np.ndarray) -> np.ndarray:
-        return np.array([x.mean()])
-
+    mean = float(values.mean())
     if len(values) == 1:
-        return Estimate(float(values.mean()), math.nan, math.nan)
+        return Estimate(mean, math.nan, math.nan)
+    if sys.version_info < (3, 11):  # for which there is no rliable: the same by hand
+        seeds, tasks = values.shape
+        draws = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds, tasks))
+        means = values[draws, np.arange(tasks)].mean((1, 2))
+        return Estimate(mean, *map(float, np.percentile(means, [2.5, 97.5])))
+    try:
+        from rliable.library import get_interval_estimates
+    except ImportError as error:
+        raise ImportError(
+            "the intervals need rliable: pip install 'torchrl-caiac[examples]'"
+        ) from error
     state = np.random.get_state()
     try:
         np.random.seed(0)  # rliable draws from the global generator
-        found, intervals = get_interval_estimates(
-            {"": values}, mean, reps=RESAMPLES, confidence_interval_size=0.95
+        _, intervals = get_interval_estimates(
+            {"": values}, lambda x: np.array([x.mean()]), reps=RESAMPLES
         )
     finally:
         np.random.set_state(state)
-    low, high = intervals[""][:, 0]
-    return Estimate(float(found[""][0]), float(low), float(high))
+    return Estimate(mean, *map(float, intervals[""][:, 0]))
 
 
 Group = tuple[str, str, str]  # setting, learner, method
@@ -138,7 +144,9 @@ class Results:
         for row in self.rows:
             mine = row["setting"], row["learner"], row["method"]
             if mine == group and row["measure"] == measure:
-                cells.setdefault(int(row["seed"]), {})[row["task"]] = float(row["value"])
+                cells.setdefault(int(row["seed"]), {})[row["task"]] = float(
+                    row["value"]
+                )
         return {
             seed: [cells[seed][task] for task in tasks]
             for seed in sorted(cells)
@@ -171,13 +179,17 @@ def report_study(study: Study, runs: Sequence[Run], folder: Path) -> list[str]:
     """Writes the tables of a study to ``<folder>/<name>.md``, and returns the lines."""
     results = Results.read(study, runs, folder)
     lines = _table(results)
-    tasks = {s: results.tasks(s, m) for s in study.settings for m in results.measures[:1]}
+    tasks = {
+        s: results.tasks(s, m) for s in study.settings for m in results.measures[:1]
+    }
     if any(len(names) > 1 for names in tasks.values()):
         lines += ["", *_task_table(results, tasks)]
     done = {tuple(row.values())[:4] for row in results.rows}
     missing = len(runs) - len(done)
-    ended = f"All {len(runs)} runs are done." if not missing else (
-        f"{missing} of {len(runs)} runs are missing."
+    ended = (
+        f"All {len(runs)} runs are done."
+        if not missing
+        else (f"{missing} of {len(runs)} runs are missing.")
     )
     lines += ["", ended]
     with whole_file(folder / f"{study.name}.md") as partial:
@@ -233,14 +245,14 @@ def answer_study(study: Study, runs: Sequence[Run], folder: Path) -> str:
     results = Results.read(study, runs, folder)
     answer = study.answer
     measure = answer.measure or (results.measures or [""])[0]
-    counts: dict[str, list[int]] = {}
+    counts: dict[str, tuple[int, int]] = {}
+    wanted = {"setting": answer.setting, "task": answer.task, "measure": measure}
     for row in results.rows:
-        if answer.setting in ("", row["setting"]) and answer.task in ("", row["task"]):
-            if row["measure"] == measure:
-                done, total = counts.setdefault(row["method"], [0, 0])
-                episodes = int(row["episodes"])
-                solved = done + round(float(row["value"]) * episodes)
-                counts[row["method"]] = [solved, total + episodes]
+        if all(value in ("", row[name]) for name, value in wanted.items()):
+            solved, total = counts.get(row["method"], (0, 0))
+            episodes = int(row["episodes"])
+            solved += round(float(row["value"]) * episodes)
+            counts[row["method"]] = solved, total + episodes
     order = [name for name in dict.fromkeys(r.method for r in runs) if name in counts]
     shares = {name: "{}/{}".format(*counts[name]) for name in order}
     if set(shares) == {BASELINE, "caiac"}:

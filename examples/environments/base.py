@@ -65,6 +65,8 @@ class Environment(ABC):
     """The entity that positions are given relative to; ``None`` for none."""
     reward_fn: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None
     """Rewards of achieved and desired goals, -1 or 0; ``None`` where it has none."""
+    episodes_have_goals: ClassVar[bool] = True
+    """Whether an episode was recorded to reach its goal, so that it can succeed."""
     data_name: ClassVar[str] = "data"
     """The name of the data in the list of stages."""
     success_key: ClassVar[str] = "success"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,7 +13,8 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 
-from environments.base import Environment, Evaluation, Split, compare_methods
+from environments.base import Environment
+from environments.playing import Split, play_together
 from shared.settings import keep_settings
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_ogbench, load_transitions, write_transitions
@@ -52,6 +53,7 @@ class OGBench(Environment):
     """
 
     action_dim = 5
+    episodes_have_goals = False
     data_name: ClassVar[str] = "play data"
     goal_reference = "robot"
 
@@ -129,20 +131,23 @@ class OGBench(Environment):
         return load_transitions(self.folder / "rows")
 
     def goal_rows(self) -> TensorDictBase:
-        """Returns the rows with a goal: what the last state of the episode achieves.
+        """Returns the rows with goals: what later states of the episodes achieve.
 
-        No episode has a goal of its own. OGBench's learners draw one of the later
-        states of the episode, all equally likely, for each row of a batch.
+        No episode has a goal of its own. All later states are equally likely, as the
+        goals of policies are in OGBench's learners, which draw new ones in each batch.
         """
         rows = self.rows().exclude("info")
         achieved = self.layout.achieved_goal(rows, next=True)
         index = trajectory_index(rows)
         last = index.ends.repeat_interleave(index.lengths)
+        first = torch.arange(len(rows))
+        generator = torch.Generator().manual_seed(self.settings.collect.seed)
+        share = torch.rand(len(rows), generator=generator, dtype=torch.float64)
+        goals = achieved[first + (share * (last - first + 1)).long()]
         rows = TensorDict(rows.to_dict(), rows.batch_size)
-        rows["desired_goal"] = achieved[last]
+        rows["desired_goal"] = goals
         if self.reward_fn is not None:
-            reward = self.reward_fn(achieved, achieved[last])
-            rows["next", "reward"] = reward[:, None]
+            rows["next", "reward"] = self.reward_fn(achieved, goals)[:, None]
         return rows
 
     def simulator(self, num_actions: int) -> SimulatorInfluence:
@@ -189,7 +194,7 @@ class OGBench(Environment):
         settings = self.settings.evaluate
         starts = {
             "test": (settings.seed, settings.episodes),
-            "validation": (settings.validation.seed, settings.validation.episodes),
+            "validation": (settings.validation_seed, settings.validation_episodes),
         }
         if split not in starts:
             raise ValueError(f"split is {split!r}, expected one of {list(starts)}")
@@ -197,7 +202,7 @@ class OGBench(Environment):
         if set(spans[0]) & set(spans[1]):
             raise ValueError(
                 f"env.evaluate: the seeds of the validation starts, {spans[1]}, are "
-                f"also some of the test starts, {spans[0]}: change validation.seed"
+                f"also some of the test starts, {spans[0]}: change validation_seed"
             )
         unknown = set(settings.tasks) - set(range(1, TASKS + 1))
         if unknown or not settings.tasks:
@@ -216,7 +221,7 @@ class OGBench(Environment):
         while len(self._envs) < number:
             self._envs.append(make_ogbench_task(self.settings.scene))
 
-    def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Returns the success of each task."""
         results = []
         for task in dict.fromkeys(episode["task"] for episode in episodes):
@@ -318,28 +323,22 @@ def play_task(
         env.reset(seed=seed, options=options)
         for env, seed in zip(envs, seeds, strict=True)
     ]
-    goals = torch.from_numpy(np.stack([info["goal"] for _, info in starts])).float()
-    states = np.stack([observation for observation, _ in starts])
-    # What a policy carries from step to step, for example a plan.
-    batch = [len(envs)]
-    carried = TensorDict({"is_init": torch.ones(*batch, 1, dtype=torch.bool)}, batch)
+    goals = [np.float32(info["goal"]) for _, info in starts]
     results = [
         {"task": f"task{task}", "episode": i, "success": False, "steps": 0}
         for i in range(len(envs))
     ]
-    running = list(range(len(envs)))
-    while running:
-        inputs = {"observation": torch.from_numpy(states).float()}
-        inputs["desired_goal"] = goals
-        with torch.no_grad():
-            output = actor(TensorDict(inputs, batch).update(carried))
+
+    def state(i: int, observation: np.ndarray) -> dict[str, np.ndarray]:
+        return {"observation": np.float32(observation), "desired_goal": goals[i]}
+
+    def step(i: int, action: np.ndarray) -> tuple[dict[str, np.ndarray], bool]:
         # As in OGBench's evaluation.
-        actions = output["action"].clamp(-1, 1).numpy()
-        carried = output.get("next", TensorDict({}, batch))
-        for i in tuple(running):
-            states[i], _, terminated, truncated, info = envs[i].step(actions[i])
-            results[i]["steps"] += 1
-            if terminated or truncated:
-                results[i]["success"] = bool(info["success"])
-                running.remove(i)
+        observation, _, terminated, truncated, info = envs[i].step(action.clip(-1, 1))
+        over = bool(terminated or truncated)
+        results[i]["steps"] += 1
+        results[i]["success"] = over and bool(info["success"])
+        return state(i, observation), over
+
+    play_together(actor, [state(i, found) for i, (found, _) in enumerate(starts)], step)
     return results

@@ -148,7 +148,10 @@ class Study:
         protocol = [
             f"validation.policies={_null(self.validation.get('policies'))}",
         ]
-        for key, part in (("validation_episodes", self.validation), ("episodes", self.test)):
+        for key, part in (
+            ("validation_episodes", self.validation),
+            ("episodes", self.test),
+        ):
             if part.get("episodes") is not None:
                 protocol.append(f"env.evaluate.{key}={part['episodes']}")
         cfg = compose(
@@ -184,31 +187,29 @@ class Study:
         Settings that are the same without them are left out too.
         """
         settings: dict[str, tuple[str, ...]] = {}
+        same: dict[str, str] = {}
         for name, overrides in self.settings.items():
             kept = tuple(o for o in overrides if _is_choice(o))
-            if kept not in settings.values():
-                settings[name] = kept
-        arms = {}
+            same[name] = next((n for n, o in settings.items() if o == kept), name)
+            settings[same[name]] = kept
+        seeds: dict[tuple[str, str], dict[str, int]] = {}
         for arm in self.arms:
-            names = [n for n in arm.settings or self.settings if n in settings]
-            if not names:  # all of them are another one by now
-                names = list(settings)[:1]
-            for name in names:
-                for method in arm.methods:
-                    arms.setdefault((name, arm.learner), {})[method] = arm.seeds[0]
+            for name in dict.fromkeys(same[n] for n in arm.settings or same):
+                methods = seeds.setdefault((name, arm.learner), {})
+                methods.update(dict.fromkeys(arm.methods, arm.seeds[0]))
+        arms = [
+            Arm(learner, tuple(methods), (min(methods.values()),), (name,))
+            for (name, learner), methods in seeds.items()
+        ]
+        answer = replace(self.answer, setting=same.get(self.answer.setting, ""))
         return replace(
             self,
             settings=settings,
-            arms=tuple(
-                Arm(learner, tuple(methods), (min(methods.values()),), (name,))
-                for (name, learner), methods in arms.items()
-            ),
+            arms=tuple(arms),
             validation={},
             test={},
             publish=None,
-            answer=replace(self.answer, setting="")
-            if self.answer.setting not in settings
-            else self.answer,
+            answer=answer,
             overrides=(*self.overrides, "size=quick"),
         )
 
@@ -334,7 +335,10 @@ def _read_study(content: Any) -> Study:
         arms.append(arm)
     _check_names("answer", content["answer"], Answer)
     answer = Answer(**{k: str(v) for k, v in content["answer"].items()})
-    for name, known in (("validation", ("policies", "episodes")), ("test", ("episodes",))):
+    for name, known in (
+        ("validation", ("policies", "episodes")),
+        ("test", ("episodes",)),
+    ):
         part = _mapping(name, content.get(name, {}))
         for key, value in part.items():
             if key not in known:

@@ -158,10 +158,37 @@ def test_noisy_data_are_of_the_other_oracle(steps, compose, cfg, tmp_path):
 def test_goals_are_positions_of_the_cubes(steps, cfg):
     environment = steps.parts.make_environment(cfg)
     rows = environment.goal_rows()
-    last = rows["next", "observation"][39]
     columns = [c + i for c in CUBES for i in range(3)]
-    assert torch.equal(rows["desired_goal"][:40], last[columns].expand(40, 6))
-    assert rows["next", "reward"][39] == 0 and len(rows["next", "reward"]) == 80
+    achieved = rows["next", "observation"][:, columns]
+    assert len(rows) == 80
+    offsets = []
+    for row in range(80):
+        later = achieved[row : 40 * (row // 40 + 1)]
+        same = (later == rows["desired_goal"][row]).all(-1).nonzero().flatten()
+        assert len(same)
+        reached = ogbench_cube_reward(achieved[row], rows["desired_goal"][row])
+        assert rows["next", "reward"][row] == reached
+        if len(same) == 1 and len(later) > 1:
+            offsets.append(float(same[0]) / (len(later) - 1))
+    # All later states are equally likely.
+    assert len(offsets) > 20 and 0.3 < np.mean(offsets) < 0.7
+
+
+def test_learners_of_values_sample_all_episodes(steps, compose, cfg):
+    small = {"out": cfg.out, "env": cfg.env}
+    whole = compose("env=ogbench_cube_double_noisy", "learner=iql", "method=[none]")
+    cfg = OmegaConf.merge(whole, small)
+    with pytest.raises(ValueError, match=r"learner.successful is 0.7.*null"):
+        made = steps.parts.make_learner(cfg, "none")
+        made.make_buffer(made.rows())
+    cfg.learner.successful = None
+    made = steps.parts.make_learner(cfg, "none")
+    rb = made.make_buffer(made.rows())
+    batch = rb.sample()
+    # With p = 0.2, the default, goals would be 5 steps away.
+    (goals,) = [t for t in rb.transform if type(t).__name__ == "HindsightGoal"]
+    assert goals.future == 0.7 and goals.p == 0.01
+    assert batch["hindsight", "relabeled"].float().mean() > 0.6
 
 
 def test_rewards_are_ogbenchs_success():
@@ -231,7 +258,7 @@ def test_starts_depend_on_the_split_alone(steps, compose, tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "match"),
     [
-        ({"validation": {"seed": 1_000_009}}, "change validation.seed"),
+        ({"validation_seed": 1_000_009}, "change validation_seed"),
         ({"tasks": [0, 1]}, r"expected some of 1 to 5"),
         ({"tasks": []}, r"expected some of 1 to 5"),
     ],
