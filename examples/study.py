@@ -189,7 +189,8 @@ def _preparation(cfg: DictConfig) -> dict[str, Any]:
     for name in ("evaluate", "augmentation"):
         env.pop(name)
     methods = OmegaConf.to_container(cfg.method, resolve=True)
-    return {"env": env, "methods": methods}
+    # The learner decides which rows are scored.
+    return {"env": env, "methods": methods, "learner": cfg.learner.name}
 
 
 @contextmanager
@@ -296,8 +297,8 @@ def preparations(runs: Sequence[Run]) -> list[DictConfig]:
     """Returns the configurations that runs need prepared, with all of their methods."""
     by_data: dict[str, DictConfig] = {}
     for run in runs:
-        env = _preparation(run.cfg)["env"]
-        found = by_data.setdefault(digest(env), run.cfg.copy())
+        needs = {**_preparation(run.cfg), "methods": None}
+        found = by_data.setdefault(digest(needs), run.cfg.copy())
         found.method = OmegaConf.merge(found.method, run.cfg.method)
     return list(by_data.values())
 

@@ -137,3 +137,37 @@ def test_who_multiplies(monkeypatch, case, want):
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: case != "absent")
     with torch.autocast("cpu", torch.bfloat16, enabled=case == "autocast"):
         assert used(monkeypatch, *operands) is want
+
+
+@pytest.mark.parametrize("relu", [False, True])
+@pytest.mark.parametrize(
+    "strided",
+    [
+        lambda: draw(64, 16)[::4],
+        lambda: draw(16, 32)[:, ::2],
+        lambda: draw(16, 32)[:, :16],
+        lambda: draw(1, 16).expand(16, 16),
+        lambda: draw(16, 16).t(),
+    ],
+    ids=["rows", "columns", "first", "expanded", "transposed"],
+)
+def test_onednn_gets_dense_operands(strided, relu, monkeypatch) -> None:
+    # On others it is hundreds of times slower.
+    monkeypatch.setattr(module, "_SMALL", 0)
+    monkeypatch.setattr(module, "_onednn", lambda *x: True)
+    product, seen = module.linear_pointwise, []
+
+    def spy(value, weight, bias, positive):
+        seen.extend([value, weight])
+        return product(value, weight, bias, positive)
+
+    monkeypatch.setattr(module, "linear_pointwise", spy)
+    value, weight = strided().requires_grad_(), strided().requires_grad_()
+    bias = draw(16, seed=2).requires_grad_()
+    out = linear(value, weight, bias, relu)
+    out.sum().backward()  # whose gradient is expanded
+    assert len(seen) == 6
+    assert all(x.is_contiguous() or x.t().is_contiguous() for x in seen)
+    torch.testing.assert_close(
+        out.double(), slow_linear(value, weight, bias, relu), rtol=1e-4, atol=1e-4
+    )
