@@ -14,7 +14,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo fetch-push influence thresholds bench docs clean
+.PHONY: help setup test lint demo fetch-push reproduce figures watch influence thresholds bench docs clean
 
 # A stamp without its interpreter (moved folder, removed Python) does not count.
 ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
@@ -62,14 +62,25 @@ lint: setup ## check style, formatting, spelling and types
 demo: setup ## the motivating experiment in the kitchen (QUICK=1: a smoke run)
 	@$(BIN)/python examples/study.py study=demo $(SIZE)
 
-fetch-push: setup ## the comparison of methods on Fetch-Push (QUICK=1: a smoke run)
+fetch-push: setup ## cloning of few demonstrations in Fetch-Push (QUICK=1: a smoke run)
 	@$(BIN)/python examples/study.py study=fetch_push $(SIZE)
+
+reproduce: setup ## run what is missing of a study (STUDY=kitchen_ratio, QUICK=1)
+	@$(BIN)/python examples/study.py study=$(or $(STUDY),$(error name a study: \
+	    make reproduce STUDY=one of $(basename $(notdir \
+	    $(wildcard examples/conf/study/*.yaml))))) $(SIZE)
+
+figures: setup ## draw the results of all studies again
+	$(BIN)/python examples/figures.py
+
+watch: setup ## film two agents of a study side by side (STUDY=demo)
+	@$(BIN)/python examples/watch.py study=$(or $(STUDY),demo) $(SIZE)
 
 influence: setup ## compare influence estimators (QUICK=1: a smoke run)
 	@for env in fetch_push kitchen kitchen_all_tasks; do \
 	    $(BIN)/python examples/compare_influence.py env=$$env \
 	        publish=$(INFLUENCE) $(SIZE); done
-	@for env in fetch_push_sliding ogbench_cube_double; do \
+	@for env in fetch_push_sliding ogbench_cube_double ogbench_scene; do \
 	    $(BIN)/python examples/compare_influence.py env=$$env \
 	        'method=[caiac,distance_action,motion,residual,oracle]' \
 	        publish=$(INFLUENCE) $(SIZE); done

@@ -1,6 +1,6 @@
 """Evaluates the saved policies of a run.
 
-Run after ``train.py``: ``python evaluate.py method=caiac seed=0``. Every policy that was
+Run after ``train.py``: ``python evaluate.py method=caiac seed=0``. Every policy that is
 kept plays from validation starts. The best one plays from the test starts, whose
 results are those of the run.
 """
@@ -16,7 +16,8 @@ import hydra
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from environments.base import Evaluation, Split
+from environments.base import Evaluation
+from environments.playing import Split
 from shared.console import progress_bar, start
 from shared.parts import candidates, make_environment, policy_file, run_folder
 from shared.settings import keep_settings
@@ -33,8 +34,8 @@ def evaluate(cfg: DictConfig, method: str, seed: int) -> Iterator[Evaluation]:
     A run with one policy has nothing to choose, and is not validated. Of policies that
     are equally good, the last one counts.
 
-    The results are saved in ``<evaluations>/<split>-<step>.json``; existing ones are not
-    repeated. They are refused if the run, or the policy, is another one by now.
+    The episodes are saved in ``<split>-<step>.json``; existing ones are not repeated.
+    They are refused if the run, or the policy, is another one by now.
 
     Yields:
         Evaluation: the last one has the split ``"test"``.
@@ -61,6 +62,7 @@ def play(
     environment = make_environment(cfg)
     folder = run_folder(cfg, method, seed) / cfg.evaluations
     kept: dict[str, Any] = OmegaConf.to_container(cfg.env.evaluate)
+    kept.pop("strips", None)  # figures
     kept["collect"] = OmegaConf.to_container(cfg.env.collect)  # has lengths of episodes
     keep_settings(folder, "evaluate", kept)
     check_run(cfg, method, seed)

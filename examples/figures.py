@@ -8,6 +8,7 @@ are rliable's: 95 %, by a bootstrap over seeds that is stratified by task.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ class Estimate(NamedTuple):
 
     Attributes:
         mean (float): over seeds and tasks.
-        low (float): the lower end.
+        low (float): the lower end; NaN with one seed, which has no interval.
         high (float): the upper end.
     """
 
@@ -43,33 +44,37 @@ class Estimate(NamedTuple):
     high: float
 
     def text(self, form: str = ".2f") -> str:
-        """Returns ``mean [low, high]``."""
+        """Returns ``mean [low, high]``, or the mean alone."""
+        if math.isnan(self.low):
+            return f"{self.mean:{form}}"
         return f"{self.mean:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
 def estimate(values: np.ndarray) -> Estimate:
-    """Returns the mean of values ``[seeds, tasks]`` and rliable's interval.
-
-    One seed, or seeds that are all equal, have an interval of no width.
-    """
-    from rliable.library import get_interval_estimates
-
-    def mean(x: np.ndarray) -> np.ndarray:
-        return np.array([x.mean()])
-
-    if (values == values[:1]).all():
-        only = float(values.mean())
-        return Estimate(only, only, only)
+    """Returns the mean of values ``[seeds, tasks]`` and rliable's interval."""
+    mean = float(values.mean())
+    if len(values) == 1:
+        return Estimate(mean, math.nan, math.nan)
+    if sys.version_info < (3, 11):  # for which there is no rliable: the same by hand
+        seeds, tasks = values.shape
+        draws = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds, tasks))
+        means = values[draws, np.arange(tasks)].mean((1, 2))
+        return Estimate(mean, *map(float, np.percentile(means, [2.5, 97.5])))
+    try:
+        from rliable.library import get_interval_estimates
+    except ImportError as error:
+        raise ImportError(
+            "the intervals need rliable: pip install 'torchrl-caiac[examples]'"
+        ) from error
     state = np.random.get_state()
     try:
         np.random.seed(0)  # rliable draws from the global generator
-        found, intervals = get_interval_estimates(
-            {"": values}, mean, reps=RESAMPLES, confidence_interval_size=0.95
+        _, intervals = get_interval_estimates(
+            {"": values}, lambda x: np.array([x.mean()]), reps=RESAMPLES
         )
     finally:
         np.random.set_state(state)
-    low, high = intervals[""][:, 0]
-    return Estimate(float(found[""][0]), float(low), float(high))
+    return Estimate(mean, *map(float, intervals[""][:, 0]))
 
 
 Group = tuple[str, str, str]  # setting, learner, method
@@ -240,14 +245,14 @@ def answer_study(study: Study, runs: Sequence[Run], folder: Path) -> str:
     results = Results.read(study, runs, folder)
     answer = study.answer
     measure = answer.measure or (results.measures or [""])[0]
-    counts: dict[str, list[int]] = {}
+    counts: dict[str, tuple[int, int]] = {}
+    wanted = {"setting": answer.setting, "task": answer.task, "measure": measure}
     for row in results.rows:
-        if answer.setting in ("", row["setting"]) and answer.task in ("", row["task"]):
-            if row["measure"] == measure:
-                done, total = counts.setdefault(row["method"], [0, 0])
-                episodes = int(row["episodes"])
-                solved = done + round(float(row["value"]) * episodes)
-                counts[row["method"]] = [solved, total + episodes]
+        if all(value in ("", row[name]) for name, value in wanted.items()):
+            solved, total = counts.get(row["method"], (0, 0))
+            episodes = int(row["episodes"])
+            solved += round(float(row["value"]) * episodes)
+            counts[row["method"]] = solved, total + episodes
     order = [name for name in dict.fromkeys(r.method for r in runs) if name in counts]
     shares = {name: "{}/{}".format(*counts[name]) for name in order}
     if set(shares) == {BASELINE, "caiac"}:

@@ -108,52 +108,48 @@ def read_arguments(arguments: Sequence[str]) -> Options:
     own: dict[str, Any] = {}
     overrides: list[str] = []
     for argument in arguments:
-        name, equals, value = argument.partition("=")
+        name, equals, _ = argument.partition("=")
         if not equals:
             raise ValueError(f"the argument {argument!r} has no value: name=value")
         if name in (*_FILTERS, "study", "processes", "root", "publish", "stale"):
             own[name] = OmegaConf.to_container(OmegaConf.from_dotlist([argument]))[name]
         else:
             overrides.append(argument)
-    only = {
-        name: [
-            str(v) for v in (own[name] if isinstance(own[name], list) else [own[name]])
-        ]
-        for name in _FILTERS
-        if name in own
-    }
+    only = {name: _texts(own[name]) for name in _FILTERS if name in own}
     processes, stale = own.get("processes", 2), own.get("stale", "refuse")
     if type(processes) is not int or processes < 0:
         raise ValueError(f"processes is {processes!r}, expected an integer from 0")
     if stale not in ("refuse", "recompute"):
         raise ValueError(f"stale is {stale!r}, expected refuse or recompute")
+    root = Path(str(own.get("root", "outputs")))
     quick = "size=quick" in overrides
+    overrides = [item for item in overrides if item != "size=quick"]
     if own.get("study") is None:
         study = ad_hoc_study(overrides, list(map(int, only.pop("seeds", []))))
-        if quick:
-            study = study.quick()
     else:
         study = load_study(str(own["study"]))
-        if chosen := [o for o in overrides if "." not in o.partition("=")[0]]:
-            if chosen != ["size=quick"] and any(
-                o.partition("=")[0] in ("env", "learner", "method") for o in chosen
-            ):
-                raise ValueError(
-                    f"{chosen} with study={study.name}: the study chooses them, leave "
-                    "them out, or choose runs by settings=, learners= and methods="
-                )
-        if quick:
-            study = study.quick()
-            overrides.remove("size=quick")
-        if overrides:  # not the results of the study as it is published
+        chosen = [o for o in overrides if o.startswith(("env=", "learner=", "method="))]
+        if chosen:
+            raise ValueError(
+                f"{chosen} with study={study.name}, which has its own: leave them out, "
+                "or choose some of its runs by settings=, learners= and methods="
+            )
+        if overrides:  # not the study as it is published
             study = replace(
                 study, overrides=(*study.overrides, *overrides), publish=None
             )
-    root = Path(str(own.get("root", "outputs")))
+    if quick:
+        study = study.quick()
     study = replace(study, overrides=(*study.overrides, f"root={root}"))
     options = Options(study, root, Path(), processes, only, stale)
+    if not any(map(options.wanted, study.runs())):
+        raise ValueError(f"the study {study.name} has no run of {only}")
     publish = own.get("publish") or study.publish or options.folder
     return replace(options, publish=Path(str(publish)))
+
+
+def _texts(value: Any) -> list[str]:
+    return [str(item) for item in (value if isinstance(value, list) else [value])]
 
 
 def prepare(cfg: DictConfig, console: Console | None = None) -> None:
@@ -171,8 +167,9 @@ def prepare(cfg: DictConfig, console: Console | None = None) -> None:
     with claim_when_free(environment.out), stage(environment.data_name):
         if not done.exists():
             collect(cfg)
-            # Here, since several folders may share the held-out rows.
-            environment.ground_truth()
+            if "caiac" in cfg.method:
+                # Here, since several folders may share the held-out rows.
+                environment.ground_truth()
     with claim_when_free(environment.folder):
         with stage("world model"):
             if not done.exists():
@@ -285,8 +282,8 @@ def missing_runs(options: Options, runs: Sequence[Run]) -> list[Run]:
         raise ValueError(
             f"{options.table} has results of {len(stale)} runs that the study "
             f"{options.study.name} does not have, or has with other settings now "
-            f"({listed}): undo the change of the settings, or give stale=recompute to "
-            "remove these results"
+            f"({listed}): undo the change of the settings, give stale=recompute to "
+            "remove these results, or give another folder with publish=..."
         )
     if stale:
         remove_runs(options.table, stale)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 
-from environments.playing import Split
+from environments.playing import Recording, Split
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer
@@ -65,6 +65,8 @@ class Environment(ABC):
     """The entity that positions are given relative to; ``None`` for none."""
     reward_fn: Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None = None
     """Rewards of achieved and desired goals, -1 or 0; ``None`` where it has none."""
+    episodes_have_goals: ClassVar[bool] = True
+    """Whether an episode was recorded to reach its goal, so that it can succeed."""
     data_name: ClassVar[str] = "data"
     """The name of the data in the list of stages."""
     success_key: ClassVar[str] = "success"
@@ -151,6 +153,20 @@ class Environment(ABC):
         Returns:
             list of dict: one dictionary for each episode, JSON values.
         """
+
+    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
+        """Plays the test episodes of a task again, and returns the first one.
+
+        Args:
+            actor (TensorDictModule): the policy.
+            seed (int): of the run.
+            task (str, optional): one of the tasks that are evaluated. Defaults to
+                ``None``: the first.
+
+        Returns:
+            Recording: the episode.
+        """
+        raise NotImplementedError(f"{type(self).__name__} records no episodes")
 
     @abstractmethod
     def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
-from environments.base import Environment, Evaluation, compare_methods
-from environments.playing import Split, play_together
+from environments.base import Environment
+from environments.playing import Recording, Split, play_together
 from torchrl_caiac.data import (
     load_minari,
     load_transitions,
@@ -28,7 +29,6 @@ from torchrl_caiac.envs.fetch_push import (
     fetch_push_reward,
 )
 from torchrl_caiac.influence import DistanceInfluence, SimulatorInfluence
-from torchrl_caiac.plotting import bootstrap_interval
 
 __all__ = ["FetchPush"]
 
@@ -39,6 +39,7 @@ POSITIONS = {
     for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
 }
 MEASURES = ("full", "cube0", "cube1")
+TASK = "two cubes"
 MAKERS = {"expert": create_fetch_push_expert, "random": create_fetch_push_random}
 
 
@@ -172,14 +173,35 @@ class FetchPush(Environment):
             "test": (settings.episodes, settings.seed),
             "validation": (settings.validation_episodes, settings.validation_seed),
         }[split]
+        torch.manual_seed(seed)  # for policies that draw
         steps = self.settings.collect.steps
         return play(actor, episodes=episodes, steps=steps, seed=first, **self.cubes)
+
+    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
+        """Plays the test episodes again, and returns the first one."""
+        if task not in (None, TASK):
+            raise ValueError(f"task is {task!r}, expected {TASK!r}")
+        settings = self.settings.evaluate
+        watched = FetchPushCubes(2, render_mode="rgb_array", **self.cubes)
+        states: list[np.ndarray] = []
+        torch.manual_seed(seed)
+        episodes = play(
+            actor,
+            episodes=settings.episodes,
+            steps=self.settings.collect.steps,
+            seed=settings.seed,
+            states=states,
+            **self.cubes,
+        )
+        watched.reset(seed=settings.seed)  # the goals of the first episode
+        success, render = episodes[0]["full"], watched.render_states
+        return Recording(TASK, np.stack(states), render, success, watched.dt)
 
     def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Returns the shares of episodes in which both, and each, cube arrived."""
         return [
             {
-                "task": "two cubes",
+                "task": TASK,
                 "measure": name,
                 "episodes": len(episodes),
                 "value": float(np.mean([episode[name] for episode in episodes])),
@@ -187,64 +209,20 @@ class FetchPush(Environment):
             for name in MEASURES
         ]
 
-    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns one line for each policy: the shares of its episodes."""
-        return [{name: _mean(evaluation, name) for name in MEASURES}]
-
-    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Returns mean success of each run, by the fraction of the data."""
-        return {
-            f"{100 * fraction:g} % of the data": _by_seed(
-                [e for e in evaluations if e.fraction == fraction], "full"
-            )
-            for fraction in dict.fromkeys(e.fraction for e in evaluations)
-        }
-
-    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Returns success by method, and CAIAC's difference to the others."""
-        steps = sorted({e.step for e in evaluations})
-        lines = [
-            f"success in {self.settings.evaluate.episodes} episodes, mean of the "
-            f"policies from step {steps[0]} to {steps[-1]}, 95 % interval over seeds",
-            f"  {'':<14}" + "".join(f"{name:>22}" for name in MEASURES),
-        ]
-        by_method = _by_method(evaluations)
-        for method, mine in by_method.items():
-            cells = []
-            for measure in MEASURES:
-                values = _by_seed(mine, measure)
-                low, high = bootstrap_interval(values)
-                cells.append(f"{np.mean(values):.3f} [{low:.3f}, {high:.3f}]")
-            lines.append(f"  {method:<14}" + "".join(f"{cell:>22}" for cell in cells))
-        if "caiac" in by_method and len(by_method) > 1:
-            lines += [
-                "",
-                "full success of caiac minus that of, 95 % interval over starts",
-            ]
-            own = _by_start(by_method.pop("caiac"))
-            for method, mine in by_method.items():
-                difference = own - _by_start(mine)
-                low, high = bootstrap_interval(difference)
-                lines.append(
-                    f"  {method:<14}{difference.mean():>+7.3f} [{low:.3f}, {high:.3f}]"
-                )
-        return lines
-
-    def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the share of episodes in which both cubes reach their goals."""
-        shares = {
-            method: f"{100 * np.mean(_by_seed(mine, 'full')):.1f} %"
-            for method, mine in _by_method(evaluations).items()
-        }
-        return f"both cubes at their goals: {compare_methods(shares)}"
-
 
 def play(
-    actor: Any, *, episodes: int, steps: int, seed: int, **cubes: float
+    actor: Any,
+    *,
+    episodes: int,
+    steps: int,
+    seed: int,
+    states: list[np.ndarray] | None = None,
+    **cubes: float,
 ) -> list[dict[str, bool]]:
     """Plays episodes in parallel, from the starts that the seed determines.
 
-    An episode ends as soon as all cubes are at their goals.
+    An episode ends as soon as all cubes are at their goals. ``states`` are filled with
+    those of the simulator in the first one.
 
     Returns:
         list of dict: for each episode whether all cubes were at their goals at some
@@ -259,9 +237,13 @@ def play(
         state, _, terminated, truncated, info = envs[number].step(action)
         reached[number] |= info["cube_success"]
         full[number] = info["cube_success"].all()
+        if states is not None and number == 0:
+            states.append(envs[0].simulator_state())
         return state, bool(full[number] or terminated or truncated)
 
     starts = [env.reset(seed=seed + number)[0] for number, env in enumerate(envs)]
+    if states is not None:
+        states.append(envs[0].simulator_state())
     play_together(actor, starts, step)
     for env in envs:
         env.close()
@@ -269,28 +251,3 @@ def play(
         {"full": bool(all_), "cube0": bool(first), "cube1": bool(second)}
         for all_, (first, second) in zip(full, reached, strict=True)
     ]
-
-
-def _mean(evaluation: Evaluation, measure: str) -> float:
-    return float(np.mean([episode[measure] for episode in evaluation.episodes]))
-
-
-def _by_method(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
-    grouped: dict[str, list[Evaluation]] = {}
-    for evaluation in evaluations:
-        grouped.setdefault(evaluation.method, []).append(evaluation)
-    return grouped
-
-
-def _by_seed(evaluations: Sequence[Evaluation], measure: str) -> list[float]:
-    """Returns means over the policies of each run."""
-    return [
-        float(np.mean([_mean(e, measure) for e in evaluations if e.seed == seed]))
-        for seed in sorted({e.seed for e in evaluations})
-    ]
-
-
-def _by_start(evaluations: Sequence[Evaluation]) -> np.ndarray:
-    """Returns full success from each start, mean over seeds and policies."""
-    played = [[episode["full"] for episode in e.episodes] for e in evaluations]
-    return np.mean(played, axis=0)

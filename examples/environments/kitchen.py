@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import gc
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,8 @@ import torch
 from minari import MinariDataset
 from tensordict import TensorDict, TensorDictBase
 
-from environments.base import Environment, Evaluation, compare_methods
-from environments.playing import Split, play_together
+from environments.base import Environment
+from environments.playing import Recording, Split, play_together
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import RenderingUnavailable
@@ -23,7 +22,10 @@ from torchrl_caiac.envs.kitchen import (
     DEMONSTRATIONS_ID,
     KITCHEN_TASKS,
     MICROWAVE_KETTLE,
+    PLAY_ANY_START_ID,
+    PLAY_ANY_START_ORDERS,
     PLAY_ID,
+    PLAY_ORDERS,
     RANDOM_ID,
     KitchenEnv,
     create_kitchen_demonstrations,
@@ -33,12 +35,17 @@ from torchrl_caiac.envs.kitchen import (
     kitchen_transitions,
 )
 from torchrl_caiac.influence import DistanceInfluence, SimulatorInfluence
-from torchrl_caiac.plotting import bootstrap_interval, plot_frames, plot_influence
+from torchrl_caiac.plotting import plot_frames, plot_influence
 from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = ["HandleDistance", "Kitchen"]
 
 LAYOUT = KitchenEnv.layout
+# Names, orders and longest attempts of the chains, by ``env.collect.chains``.
+CHAINS = {
+    "play": (PLAY_ID, PLAY_ORDERS, 400),
+    "play_any_start": (PLAY_ANY_START_ID, PLAY_ANY_START_ORDERS, 440),
+}
 
 
 class Kitchen(Environment):
@@ -67,7 +74,13 @@ class Kitchen(Environment):
             "overwrite": True,
             "progress": progress,
         }
-        demonstrations = PLAY_ID if settings.chains else DEMONSTRATIONS_ID
+        chains = settings.chains
+        if chains not in (None, *CHAINS):
+            raise ValueError(
+                f"env.collect.chains is {chains!r}, expected null, for single tasks, "
+                f"or one of {list(CHAINS)}"
+            )
+        demonstrations = DEMONSTRATIONS_ID if chains is None else CHAINS[chains][0]
         for name, dataset_id, episodes, seed in (
             ("demonstrations", demonstrations, settings.episodes, settings.seed),
             ("held_out", "kitchen/held-out-v0", settings.held_out, settings.seed + 1),
@@ -89,9 +102,16 @@ class Kitchen(Environment):
         self, dataset_id: str, episodes: int, seed: int, options: dict[str, Any]
     ) -> MinariDataset:
         """Collects this number of demonstrations of each task, or chain of tasks."""
-        if self.settings.collect.chains:
+        chains = self.settings.collect.chains
+        if chains is not None:
+            _, orders, max_steps = CHAINS[chains]
             return create_kitchen_play(
-                dataset_id, episodes=episodes, seed=seed, **options
+                dataset_id,
+                orders=orders,
+                episodes=episodes,
+                max_steps=max_steps,
+                seed=seed,
+                **options,
             )[0]
         groups = [dataclasses.replace(g, episodes=episodes) for g in MICROWAVE_KETTLE]
         return create_kitchen_demonstrations(
@@ -153,6 +173,22 @@ class Kitchen(Environment):
             close(kitchens)
         return episodes
 
+    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
+        """Plays the test episodes of a task again, and returns the first one."""
+        settings = self.settings.evaluate
+        task = settings.tasks[0] if task is None else task
+        if task not in settings.tasks:
+            raise ValueError(f"task is {task!r}, expected one of {settings.tasks}")
+        seeds = self.start_seeds(seed, "test")
+        kitchens = [KitchenEnv() for _ in seeds]
+        try:
+            torch.manual_seed(seeds[0])
+            result, states = play_task(actor, kitchens, task, settings.start, seeds)[0]
+            success, seconds = result["success"], kitchens[0].dt
+            return Recording(task, states, render, success, seconds)
+        finally:
+            close(kitchens)
+
     def start_seeds(self, seed: int, split: Split) -> range:
         """Returns the seeds of the starts of a run, which no other split or run has."""
         settings = self.settings.evaluate
@@ -184,54 +220,6 @@ class Kitchen(Environment):
                 for measure in ("success", "task_success")
             ]
         return rows
-
-    def results(self, evaluation: Evaluation) -> list[dict[str, Any]]:
-        """Returns one line for each episode."""
-        return [
-            {**episode, "wrong_tasks": " ".join(episode["wrong_tasks"])}
-            for episode in evaluation.episodes
-        ]
-
-    def bars(self, evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
-        """Returns success of all episodes, by task."""
-        return {
-            task: [float(e["success"]) for e in _of_task(evaluations, task)]
-            for task in self.settings.evaluate.tasks
-        }
-
-    def table(self, evaluations: Sequence[Evaluation]) -> list[str]:
-        """Returns success by method and task, and which wrong tasks were done."""
-        lines = [
-            "success over all objects, 95 % interval over episodes; over the task's own"
-        ]
-        for method, task in product(
-            _methods(evaluations), self.settings.evaluate.tasks
-        ):
-            mine = _of_task(evaluations, task, method)
-            solved = [float(e["success"]) for e in mine]
-            low, high = bootstrap_interval(solved)
-            wrong = {
-                name: count
-                for name in KITCHEN_TASKS
-                if (count := sum(name in e["wrong_tasks"] for e in mine))
-            }
-            lines.append(
-                f"  {method:<13}{task:<15}{sum(solved) / len(solved):>6.2f} "
-                f"[{low:.2f}, {high:.2f}] of {len(mine)}; "
-                f"{sum(e['task_success'] for e in mine) / len(mine):.2f}   "
-                "wrong tasks done: "
-                + (", ".join(f"{name} {n}" for name, n in wrong.items()) or "none")
-            )
-        return lines
-
-    def answer(self, evaluations: Sequence[Evaluation]) -> str:
-        """Returns the solved episodes of the study's task, or of all tasks."""
-        question = self.settings.answer
-        shares = {}
-        for method in _methods(evaluations):
-            mine = _of_task(evaluations, question.task, method)
-            shares[method] = f"{sum(e['success'] for e in mine)}/{len(mine)}"
-        return f"{question.text}: {compare_methods(shares)}"
 
     def draw(self, folder: Path, name: str, *, threshold: float) -> list[str]:
         """Draws the influence along a demonstration, and counterfactual frames."""
@@ -403,20 +391,3 @@ def close(kitchens: list[KitchenEnv]) -> None:
         kitchen.close()
     kitchens.clear()
     gc.collect()
-
-
-def _methods(evaluations: Sequence[Evaluation]) -> list[str]:
-    return list(dict.fromkeys(evaluation.method for evaluation in evaluations))
-
-
-def _of_task(
-    evaluations: Sequence[Evaluation], task: str | None, method: str | None = None
-) -> list[dict[str, Any]]:
-    """Returns the episodes of a task and a method; ``None`` for all."""
-    return [
-        episode
-        for evaluation in evaluations
-        if method in (None, evaluation.method)
-        for episode in evaluation.episodes
-        if task in (None, episode["task"])
-    ]

@@ -97,10 +97,17 @@ class HindsightLearner(GoalConditioned):
             environment.layout,
             environment.reward_fn,
             random=0.5 * ratio if augmentation is None else 0.0,
+            **self.augmentation.get("hindsight", {}),
         )
         options: dict[str, Any] = {}
         share = self.settings.get("successful")
         if share is not None:
+            if not environment.episodes_have_goals:
+                raise ValueError(
+                    f"learner.successful is {share}, but no episode of "
+                    f"{type(environment).__name__} has a goal of its own that it could "
+                    "reach: set it to null"
+                )
             options["sampler"] = ShareSampler(until_success(rows), share)
         rb = offline_buffer(rows, self.rows_at_once, sample_unit=goals, **options)
         if augmentation is not None:

@@ -155,10 +155,10 @@ class Study:
             if part.get("episodes") is not None:
                 protocol.append(f"env.evaluate.{key}={part['episodes']}")
         cfg = compose(
+            *protocol,  # settings and arms may have others
             *self.settings[setting],
             f"learner={arm.learner}",
             f"method=[{','.join(arm.methods)}]",
-            *protocol,
             *arm.overrides,
             *self.overrides,
         )
@@ -169,7 +169,7 @@ class Study:
             mine.runs = f"runs/{arm.learner}-{digest(made_with)}"
             evaluated = {
                 "steps": mine.learner.steps,
-                "evaluate": mine.env.evaluate,
+                "evaluate": {**mine.env.evaluate, "strips": None},
                 "validation": mine.validation,
             }
             mine.evaluations = f"evaluation-{digest(evaluated)}"
@@ -187,31 +187,29 @@ class Study:
         Settings that are the same without them are left out too.
         """
         settings: dict[str, tuple[str, ...]] = {}
+        same: dict[str, str] = {}
         for name, overrides in self.settings.items():
             kept = tuple(o for o in overrides if _is_choice(o))
-            if kept not in settings.values():
-                settings[name] = kept
-        arms = {}
+            same[name] = next((n for n, o in settings.items() if o == kept), name)
+            settings[same[name]] = kept
+        seeds: dict[tuple[str, str], dict[str, int]] = {}
         for arm in self.arms:
-            names = [n for n in arm.settings or self.settings if n in settings]
-            if not names:  # all of them are another one by now
-                names = list(settings)[:1]
-            for name in names:
-                for method in arm.methods:
-                    arms.setdefault((name, arm.learner), {})[method] = arm.seeds[0]
+            for name in dict.fromkeys(same[n] for n in arm.settings or same):
+                methods = seeds.setdefault((name, arm.learner), {})
+                methods.update(dict.fromkeys(arm.methods, arm.seeds[0]))
+        arms = [
+            Arm(learner, tuple(methods), (min(methods.values()),), (name,))
+            for (name, learner), methods in seeds.items()
+        ]
+        answer = replace(self.answer, setting=same.get(self.answer.setting, ""))
         return replace(
             self,
             settings=settings,
-            arms=tuple(
-                Arm(learner, tuple(methods), (min(methods.values()),), (name,))
-                for (name, learner), methods in arms.items()
-            ),
+            arms=tuple(arms),
             validation={},
             test={},
             publish=None,
-            answer=replace(self.answer, setting="")
-            if self.answer.setting not in settings
-            else self.answer,
+            answer=answer,
             overrides=(*self.overrides, "size=quick"),
         )
 
@@ -224,7 +222,7 @@ def run_settings(cfg: DictConfig, method: str) -> dict[str, Any]:
     """
     made = make_method(cfg, method)
     env: dict[str, Any] = OmegaConf.to_container(cfg.env, resolve=True)
-    unused = {*_SHOWN, *_MODELS, "evaluate", "residual", "score", "truth", "answer"}
+    unused = {*_SHOWN, *_MODELS, "evaluate", "residual", "score", "truth"}
     unused -= {*made.models, *made.env_settings}
     if made.score_key is not None:
         unused.discard("score")

@@ -37,12 +37,14 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_the_study_is_started(
     caiac: Caiac, calls: list[list[str]], tmp_path: Path
 ) -> None:
-    assert caiac("demo", "--out", "here", "--json").document == {"written": "here"}
+    assert caiac("demo", "--out", "here", "--json").document == {
+        "written": "here/studies/demo"
+    }
     ((python, study, *arguments),) = calls
     assert python == sys.executable and Path(study).read_text().startswith(
         '"""Runs all'
     )
-    assert arguments == ["study=demo", f"out={tmp_path / 'work' / 'here'}"]
+    assert arguments == ["study=demo", f"root={tmp_path / 'work' / 'here'}"]
 
 
 def test_a_study_that_fails(caiac: Caiac, calls: list[list[str]]) -> None:

@@ -14,10 +14,11 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study")
+SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study", "figures")
 SCRIPTS += ("compare_influence", "compare_precision")
 SCRIPTS += ("suggest_thresholds", "sweep_variance_floor")
-SHARED = ("console", "log", "parts", "settings", "tables", "thresholds")
+SHARED = ("console", "log", "parts", "results", "settings", "studies", "tables")
+SHARED += ("thresholds",)
 SMALL_ENV = {
     "kitchen": {
         "collect": {"episodes": 2, "held_out": 1},
@@ -44,6 +45,12 @@ SMALL_ENV = {
     },
 }
 SMALL_ENV["kitchen_all_tasks"] = SMALL_ENV["kitchen"]
+SMALL_ENV["ogbench_scene"] = SMALL_ENV["ogbench_cube_double"]
+SMALL_ENV["ogbench_cube_double_play"] = SMALL_ENV["ogbench_cube_double"] | {
+    "demonstrations": 2,
+    "evaluate": {"episodes": 2, "validation_episodes": 1},
+}
+SMALL_ENV["ogbench_cube_double_noisy"] = SMALL_ENV["ogbench_cube_double_play"]
 _SMALL = {
     "steps": 12,
     "batch_size": 32,

@@ -40,7 +40,7 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
     parser.add_argument(
         "--out",
         metavar="DIR",
-        help="the folder to write; default: outputs/franka_kitchen",
+        help="the folder to write; default: outputs",
     )
     parser.set_defaults(run=run)
     return parser
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         )
     command = [sys.executable, str(_folder() / "study.py"), "study=demo"]
     command += ["size=quick"] if args.quick else []
-    command += [f"out={Path(args.out).resolve()}"] if args.out else []
+    command += [f"root={Path(args.out).resolve()}"] if args.out else []
     # The study writes its own stages, and their output to log.txt. With JSON, they are
     # progress, and go to the standard error.
     streams = console.streams
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         console.error(f"the demo ended with exit code {done.returncode}")
         return FAILED
     size = "_quick" if args.quick else ""
-    out = Path(args.out) if args.out else Path("outputs") / f"franka_kitchen{size}"
+    out = Path(args.out or "outputs") / "studies" / f"demo{size}"
     console.document({"written": str(out)})
     return OK
 

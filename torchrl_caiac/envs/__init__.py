@@ -43,6 +43,8 @@ from torchrl_caiac.envs.ogbench import (
     OGBenchTruth,
     create_ogbench_play,
     make_ogbench_env,
+    make_ogbench_task,
+    ogbench_cube_reward,
     ogbench_states,
     resimulate_swaps,
 )
@@ -83,6 +85,8 @@ __all__ = [
     "make_fetch_push_env",
     "make_kitchen_env",
     "make_ogbench_env",
+    "make_ogbench_task",
+    "ogbench_cube_reward",
     "ogbench_states",
     "random_transitions",
     "resimulate_swaps",

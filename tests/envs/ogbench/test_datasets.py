@@ -111,6 +111,7 @@ def test_noisy_episodes_have_independent_noise(tmp_path):
         "episodes": 1,
         "steps": 30,
         "noisy": True,
+        "random_actions": 0.0,
         "num_workers": 1,
         "progress": False,
     }
@@ -124,6 +125,34 @@ def test_noisy_episodes_have_independent_noise(tmp_path):
     assert (loud["actions"][:, 4] > 0).any()
 
 
+def test_a_share_of_noisy_actions_is_random(tmp_path):
+    def actions(name, **options):
+        file = create_ogbench_play(
+            tmp_path / f"{len(list(tmp_path.iterdir()))}.npz",
+            name,
+            episodes=1,
+            steps=400,
+            noisy=True,
+            action_noise=0.0,
+            num_workers=1,
+            progress=False,
+            **options,
+        )
+        return np.load(file)["actions"]
+
+    def random(rows):
+        # The oracle opens or closes the gripper all the way.
+        return np.abs(rows[:, 4]) < 1
+
+    shares = [random(actions("cube-single")).mean()]
+    shares.append(random(actions("puzzle-3x3")).mean())
+    assert 0.05 < shares[0] < 0.15 < shares[1] < 0.28
+    drawn = actions("cube-single", random_actions=1.0)
+    assert random(drawn).all()
+    assert (np.abs(drawn.mean(0)) < 0.12).all()
+    assert np.allclose(drawn.std(0), 3**-0.5, atol=0.08)
+
+
 @pytest.mark.parametrize(
     ("wrong", "match"),
     [
@@ -132,6 +161,8 @@ def test_noisy_episodes_have_independent_noise(tmp_path):
         ({"episodes": 0}, "episodes is 0"),
         ({"steps": 0}, "steps is 0"),
         ({"noisy": True, "action_noise": float("nan")}, "action_noise"),
+        ({"noisy": True, "random_actions": float("nan")}, "random_actions"),
+        ({"noisy": True, "random_actions": 1.5}, "random_actions"),
     ],
 )
 def test_bad_input(wrong, match, tmp_path):

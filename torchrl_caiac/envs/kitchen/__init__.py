@@ -6,6 +6,8 @@ from torchrl_caiac.envs.kitchen.chain import KitchenChain
 from torchrl_caiac.envs.kitchen.datasets import (
     DEMONSTRATIONS_ID,
     MICROWAVE_KETTLE,
+    PLAY_ANY_START_ID,
+    PLAY_ANY_START_ORDERS,
     PLAY_ID,
     PLAY_ORDERS,
     RANDOM_ID,
@@ -38,6 +40,8 @@ __all__ = [
     "KITCHEN_ENV_ID",
     "KITCHEN_TASKS",
     "MICROWAVE_KETTLE",
+    "PLAY_ANY_START_ID",
+    "PLAY_ANY_START_ORDERS",
     "PLAY_ID",
     "PLAY_ORDERS",
     "RANDOM_ID",

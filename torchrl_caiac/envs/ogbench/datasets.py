@@ -50,6 +50,8 @@ _SCENE_SIDES = (-0.3, 0.29)
 _DRAWER_HEIGHTS = (0.06, 0.08)
 # The noise on positions, yaw and gripper of a noisy episode, relative to its level.
 _NOISE = np.array([1.0, 1.0, 1.0, 3.0, 10.0])
+# The share of random actions in OGBench's noisy datasets.
+_RANDOM, _RANDOM_IN_PUZZLES = 0.1, 0.2
 
 
 def create_ogbench_play(
@@ -61,6 +63,7 @@ def create_ogbench_play(
     seed: int = 0,
     noisy: bool = False,
     action_noise: float = 0.1,
+    random_actions: float | None = None,
     work: str | os.PathLike[str] | None = None,
     num_workers: int | None = None,
     overwrite: bool = False,
@@ -87,12 +90,15 @@ def create_ogbench_play(
             Defaults to 0.
         noisy (bool): if ``False``, an oracle follows a plan with correlated noise
             (OGBench's ``play``). If ``True``, it is a function of the state, with
-            independent noise on its actions (OGBench's ``noisy``). Defaults to
-            ``False``.
+            independent noise on its actions, some of which are random (OGBench's
+            ``noisy``). Defaults to ``False``.
         action_noise (float): the highest standard deviation of the noise on actions of
             ``noisy`` episodes, which are in [-1, 1]. Each episode draws its own; the
             noise on the yaw is 3 times, on the gripper 10 times as large. Defaults to
             0.1.
+        random_actions (float, optional): the share of actions of ``noisy`` episodes
+            that are drawn uniformly instead. Defaults to ``None``: as in OGBench, 0.2
+            in the puzzles and 0.1 elsewhere.
         work (path, optional): a folder for finished episodes, from which an interrupted
             collection resumes. Defaults to a temporary folder.
         num_workers (int, optional): the number of processes. The result does not depend
@@ -135,12 +141,13 @@ def create_ogbench_play(
             raise ValueError(f"{argument} is {value}, expected at least 1")
     if not (np.isfinite(action_noise) and action_noise >= 0):
         raise ValueError(f"action_noise is {action_noise}, expected at least 0")
-    spec = {
-        "name": name,
-        "steps": steps,
-        "noisy": noisy,
-        **({"action_noise": action_noise} if noisy else {}),
-    }
+    if random_actions is None:
+        random_actions = _RANDOM_IN_PUZZLES if name.startswith("puzzle") else _RANDOM
+    if not 0 <= random_actions <= 1:
+        raise ValueError(f"random_actions is {random_actions}, expected 0 to 1")
+    spec: dict[str, Any] = {"name": name, "steps": steps, "noisy": noisy}
+    if noisy:
+        spec |= {"action_noise": action_noise, "random_actions": random_actions}
     with collection_folder(work) as folder:
         report = collect_episodes(
             functools.partial(_Source, name, steps + 1, noisy),
@@ -191,14 +198,18 @@ class _Source:
         observation, info = env.reset(seed=seed)
         stacking = rng.uniform(*_STACKING.get(self.name, (0.5, 0.5)))
         level = rng.uniform(0.0, spec.get("action_noise", 0.0))
+        share = spec.get("random_actions", 0.0)
         oracle = self._start(observation, info)
         rows: dict[str, list[Any]] = {key: [] for key in _TYPES}
         over = False
         while not over:
-            action = np.asarray(oracle.select_action(observation, info))
-            noise = rng.normal(size=5) * level * _NOISE
+            if share and rng.uniform() < share:
+                action = rng.uniform(-1.0, 1.0, 5)
+            else:
+                action = np.asarray(oracle.select_action(observation, info))
+                action = action + rng.normal(size=5) * level * _NOISE
             # As it is stored.
-            action = np.clip(action + noise, -1, 1).astype(np.float32)
+            action = np.clip(action, -1, 1).astype(np.float32)
             rows["observations"].append(observation)
             rows["actions"].append(action)
             observation, _, terminated, truncated, info = env.step(action)

@@ -17,6 +17,8 @@ from torchrl_caiac.envs.kitchen.datasets.demonstrations import (
     create_kitchen_demonstrations,
 )
 from torchrl_caiac.envs.kitchen.datasets.play import (
+    PLAY_ANY_START_ID,
+    PLAY_ANY_START_ORDERS,
     PLAY_ID,
     PLAY_ORDERS,
     create_kitchen_play,
@@ -31,6 +33,8 @@ from torchrl_caiac.envs.kitchen.datasets.transitions import kitchen_transitions
 __all__ = [
     "DEMONSTRATIONS_ID",
     "MICROWAVE_KETTLE",
+    "PLAY_ANY_START_ID",
+    "PLAY_ANY_START_ORDERS",
     "PLAY_ID",
     "PLAY_ORDERS",
     "RANDOM_ID",

@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     from minari import MinariDataset
     from numpy.typing import NDArray
 
-__all__ = ["PLAY_ID", "PLAY_ORDERS", "create_kitchen_play"]
+__all__ = [
+    "PLAY_ANY_START_ID",
+    "PLAY_ANY_START_ORDERS",
+    "PLAY_ID",
+    "PLAY_ORDERS",
+    "create_kitchen_play",
+]
 
 #: Minari's name of the chains, unless another is given.
 PLAY_ID = "kitchen/play-v0"
@@ -38,6 +44,29 @@ PLAY_ORDERS = (
     ("microwave", "bottom burner", "light switch", "hinge cabinet"),
     ("kettle", "light switch", "hinge cabinet", "slide cabinet"),
     ("bottom burner", "light switch", "slide cabinet", "hinge cabinet"),
+)
+#: Minari's name of the chains of :data:`PLAY_ANY_START_ORDERS`.
+PLAY_ANY_START_ID = "kitchen/play-any-start-v0"
+# The hinge cabinet comes before tasks that its open door does not obstruct.
+_CYCLE = (
+    "microwave",
+    "kettle",
+    "bottom burner",
+    "top burner",
+    "light switch",
+    "slide cabinet",
+    "hinge cabinet",
+)
+#: Orders in which every task is once the first, second, third and last: four tasks of
+#: a cycle, from each of the seven. So every task is shown from the default start, which
+#: :data:`PLAY_ORDERS` shows for three. When a task begins, either nothing is done or
+#: exactly the one, two or three tasks before it in the cycle: 4 of the 64 combinations
+#: of the six others. No object is ever between its two configurations, except while its
+#: own task is played. Pass ``max_steps=440``: at the lowest speed, chains with the
+#: hinge cabinet take up to 420 steps.
+PLAY_ANY_START_ORDERS = tuple(
+    tuple(_CYCLE[(first + step) % len(_CYCLE)] for step in range(4))
+    for first in range(len(_CYCLE))
 )
 
 
