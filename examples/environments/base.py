@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 
-from environments.playing import Split
+from environments.playing import Recording, Split
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer
@@ -153,6 +153,20 @@ class Environment(ABC):
         Returns:
             list of dict: one dictionary for each episode, JSON values.
         """
+
+    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
+        """Plays the test episodes of a task again, and returns the first one.
+
+        Args:
+            actor (TensorDictModule): the policy.
+            seed (int): of the run.
+            task (str, optional): one of the tasks that are evaluated. Defaults to
+                ``None``: the first.
+
+        Returns:
+            Recording: the episode.
+        """
+        raise NotImplementedError(f"{type(self).__name__} records no episodes")
 
     @abstractmethod
     def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from environments.base import Environment
-from environments.playing import Split, play_together
+from environments.playing import Recording, Split, play_together
 from torchrl_caiac.data import (
     load_minari,
     load_transitions,
@@ -38,6 +39,7 @@ POSITIONS = {
     for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
 }
 MEASURES = ("full", "cube0", "cube1")
+TASK = "two cubes"
 MAKERS = {"expert": create_fetch_push_expert, "random": create_fetch_push_random}
 
 
@@ -171,14 +173,35 @@ class FetchPush(Environment):
             "test": (settings.episodes, settings.seed),
             "validation": (settings.validation_episodes, settings.validation_seed),
         }[split]
+        torch.manual_seed(seed)  # for policies that draw
         steps = self.settings.collect.steps
         return play(actor, episodes=episodes, steps=steps, seed=first, **self.cubes)
+
+    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
+        """Plays the test episodes again, and returns the first one."""
+        if task not in (None, TASK):
+            raise ValueError(f"task is {task!r}, expected {TASK!r}")
+        settings = self.settings.evaluate
+        watched = FetchPushCubes(2, render_mode="rgb_array", **self.cubes)
+        states: list[np.ndarray] = []
+        torch.manual_seed(seed)
+        episodes = play(
+            actor,
+            episodes=settings.episodes,
+            steps=self.settings.collect.steps,
+            seed=settings.seed,
+            states=states,
+            **self.cubes,
+        )
+        watched.reset(seed=settings.seed)  # the goals of the first episode
+        success, render = episodes[0]["full"], watched.render_states
+        return Recording(TASK, np.stack(states), render, success, watched.dt)
 
     def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Returns the shares of episodes in which both, and each, cube arrived."""
         return [
             {
-                "task": "two cubes",
+                "task": TASK,
                 "measure": name,
                 "episodes": len(episodes),
                 "value": float(np.mean([episode[name] for episode in episodes])),
@@ -188,11 +211,18 @@ class FetchPush(Environment):
 
 
 def play(
-    actor: Any, *, episodes: int, steps: int, seed: int, **cubes: float
+    actor: Any,
+    *,
+    episodes: int,
+    steps: int,
+    seed: int,
+    states: list[np.ndarray] | None = None,
+    **cubes: float,
 ) -> list[dict[str, bool]]:
     """Plays episodes in parallel, from the starts that the seed determines.
 
-    An episode ends as soon as all cubes are at their goals.
+    An episode ends as soon as all cubes are at their goals. ``states`` are filled with
+    those of the simulator in the first one.
 
     Returns:
         list of dict: for each episode whether all cubes were at their goals at some
@@ -207,9 +237,13 @@ def play(
         state, _, terminated, truncated, info = envs[number].step(action)
         reached[number] |= info["cube_success"]
         full[number] = info["cube_success"].all()
+        if states is not None and number == 0:
+            states.append(envs[0].simulator_state())
         return state, bool(full[number] or terminated or truncated)
 
     starts = [env.reset(seed=seed + number)[0] for number, env in enumerate(envs)]
+    if states is not None:
+        states.append(envs[0].simulator_state())
     play_together(actor, starts, step)
     for env in envs:
         env.close()

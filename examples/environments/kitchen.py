@@ -14,7 +14,7 @@ from minari import MinariDataset
 from tensordict import TensorDict, TensorDictBase
 
 from environments.base import Environment
-from environments.playing import Split, play_together
+from environments.playing import Recording, Split, play_together
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import RenderingUnavailable
@@ -172,6 +172,22 @@ class Kitchen(Environment):
         finally:
             close(kitchens)
         return episodes
+
+    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
+        """Plays the test episodes of a task again, and returns the first one."""
+        settings = self.settings.evaluate
+        task = settings.tasks[0] if task is None else task
+        if task not in settings.tasks:
+            raise ValueError(f"task is {task!r}, expected one of {settings.tasks}")
+        seeds = self.start_seeds(seed, "test")
+        kitchens = [KitchenEnv() for _ in seeds]
+        try:
+            torch.manual_seed(seeds[0])
+            result, states = play_task(actor, kitchens, task, settings.start, seeds)[0]
+            success, seconds = result["success"], kitchens[0].dt
+            return Recording(task, states, render, success, seconds)
+        finally:
+            close(kitchens)
 
     def start_seeds(self, seed: int, split: Split) -> range:
         """Returns the seeds of the starts of a run, which no other split or run has."""

@@ -3,18 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-__all__ = ["Split", "play_together"]
+__all__ = ["Recording", "Split", "play_together"]
 
 Split: TypeAlias = Literal["validation", "test"]
 """The starts that choose a training step, and those that are reported."""
 
 Step: TypeAlias = Callable[[int, np.ndarray], tuple[Mapping[str, np.ndarray], bool]]
+
+
+class Recording(NamedTuple):
+    """An episode that can be looked at.
+
+    Attributes:
+        task (str): what was asked for.
+        states (numpy.ndarray): ``[L + 1, S]``, what :attr:`render` takes.
+        render (Callable): takes states ``[F, S]``, returns frames ``[F, 240, 320, 3]``.
+        success (bool): whether the episode succeeded.
+        seconds (float): the duration of a step.
+    """
+
+    task: str
+    states: np.ndarray
+    render: Callable[[np.ndarray], np.ndarray]
+    success: bool
+    seconds: float
 
 
 def play_together(

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import (
+    InteractionType,
+    TensorDictModuleBase,
+    set_interaction_type,
+)
 from tensordict.utils import NestedKey
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
@@ -30,6 +34,8 @@ class ChunkActor(TensorDictModuleBase):
         size (int): the number of actions in a chunk.
         execute (int): how many of them are played, at most ``size``.
         action_dim (int): the size of an action; actions are in [-1, 1].
+        sample (bool): whether the policy draws chunks at random, with torch's default
+            generator, or returns its deterministic one.
     """
 
     def __init__(
@@ -39,6 +45,7 @@ class ChunkActor(TensorDictModuleBase):
         size: int,
         execute: int,
         action_dim: int,
+        sample: bool = False,
     ) -> None:
         super().__init__()
         if not 1 <= execute <= size:
@@ -48,6 +55,9 @@ class ChunkActor(TensorDictModuleBase):
         self.policy = policy
         self.shape = (size, action_dim)
         self.execute = execute
+        self.interaction = (
+            InteractionType.RANDOM if sample else InteractionType.DETERMINISTIC
+        )
         self.in_keys = [*policy.in_keys, "is_init", _CHUNK, _STEP]
         self.out_keys = ["action", ("next", *_CHUNK), ("next", *_STEP)]
 
@@ -75,7 +85,8 @@ class ChunkActor(TensorDictModuleBase):
         new = (step == 0).squeeze(-1)
         if new.any():
             inputs = tensordict.select(*self.policy.in_keys)[new]
-            planned = self.policy(inputs)["chunk"].clamp(-1.0, 1.0)
+            with set_interaction_type(self.interaction):
+                planned = self.policy(inputs)["chunk"].clamp(-1.0, 1.0)
             chunk = chunk.clone()
             chunk[new] = planned.unflatten(-1, self.shape).to(chunk.dtype)
         action = chunk.take_along_dim(step.unsqueeze(-1), -2).squeeze(-2)

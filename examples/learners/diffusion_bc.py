@@ -26,10 +26,13 @@ _FREQUENCIES = 8  # sines and cosines that describe a step of the diffusion
 class ScoreNetwork(nn.Module):
     """Predicts the noise in a chunk from ``[chunk, features, step]``.
 
+    The features are encoded apart from the chunk, whose noise would disturb them.
+
     Args:
         features (int): the number of features.
         chunk (int): the number of values in a chunk.
-        hidden_sizes (list of int): widths of the hidden layers.
+        hidden_sizes (list of int): widths of the hidden layers of encoder and decoder,
+            two at least.
         steps (int): of the diffusion.
     """
 
@@ -37,40 +40,39 @@ class ScoreNetwork(nn.Module):
         self, features: int, chunk: int, hidden_sizes: list[int], steps: int
     ) -> None:
         super().__init__()
+        self.chunk = chunk
         self.steps = steps
-        self.network = MLP(
-            chunk + features + 2 * _FREQUENCIES,
-            chunk,
-            num_cells=hidden_sizes,
-            activation_class=nn.SiLU,
-        )
+        first, *rest = hidden_sizes
+        options = {"num_cells": rest, "activation_class": nn.SiLU}
+        self.features = MLP(features, first, **options)
+        self.noisy = nn.Linear(chunk + 2 * _FREQUENCIES, first)
+        self.noise = nn.Sequential(nn.SiLU(), MLP(first, chunk, **options))
 
     def forward(self, value: torch.Tensor) -> torch.Tensor:
         """Returns the noise, ``[*B, chunk]``."""
-        rest, step = value[..., :-1], value[..., -1:]
+        chunk, features, step = value.tensor_split((self.chunk, -1), -1)
         powers = torch.arange(_FREQUENCIES, dtype=value.dtype, device=value.device)
         angle = 0.5 * math.pi * step / self.steps * 2.0**powers
-        noise: torch.Tensor = self.network(
-            torch.cat([rest, angle.sin(), angle.cos()], -1)
-        )
+        noisy = self.noisy(torch.cat([chunk, angle.sin(), angle.cos()], -1))
+        noise: torch.Tensor = self.noise(self.features(features) + noisy)
         return noise
 
 
 class DiffusionBC(BC):
-    """Draws chunks of actions by diffusion; plays the first actions of each.
+    """Makes chunks of actions by diffusion; plays the first actions of each.
 
     A row is the first state of a window with the actions of the whole window. All rows
     of a window are swapped together, so the method's rule holds for the whole chunk.
     """
 
-    actor: ChunkActor  # type: ignore[assignment]
+    actor: ChunkActor
 
     @property
-    def window(self) -> int:  # type: ignore[override]
+    def window(self) -> int:
         """The number of actions in a chunk."""
         return int(self.settings.chunk)
 
-    def make_actor(  # type: ignore[override]
+    def make_actor(
         self, features: GoalFeatures, action_key: NestedKey = "action"
     ) -> ChunkActor:
         """Returns the policy, which carries its chunk from step to step."""
@@ -95,6 +97,7 @@ class DiffusionBC(BC):
             size=self.window,
             execute=settings.execute,
             action_dim=action_dim,
+            sample=settings.sample,
         )
 
     def make_loss(self) -> DiffusionBCLoss:

@@ -51,7 +51,17 @@ SMALL_ENV["ogbench_cube_double_play"] = SMALL_ENV["ogbench_cube_double"] | {
     "evaluate": {"episodes": 2, "validation_episodes": 1},
 }
 SMALL_ENV["ogbench_cube_double_noisy"] = SMALL_ENV["ogbench_cube_double_play"]
+_SMALL = {
+    "steps": 12,
+    "batch_size": 32,
+    "batches_at_once": 2,
+    "hidden_sizes": [16, 16],
+    "log_every": 4,
+    "checkpoint_every": 6,
+    "keep_every": 4,
+}
 SMALL_LEARNER = {
+    **{name: _SMALL for name in ("bc", "diffusion_bc", "td3_bc", "iql")},
     "lmp": {
         "steps": 12,
         "windows": 16,

@@ -10,6 +10,12 @@ import torch
 
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import KITCHEN_TASKS, KitchenEnv
+from torchrl_caiac.envs.kitchen import (
+    PLAY_ANY_START_ID,
+    PLAY_ANY_START_ORDERS,
+    PLAY_ID,
+    PLAY_ORDERS,
+)
 
 METHODS = ["none", "caiac", "coda", "coda_action", "oracle", "relabel_only"]
 
@@ -59,14 +65,11 @@ def test_scores_and_their_report(environment):
     report = json.loads((environment.out / "influence.json").read_text())
     assert list(report) == ["smoothing 1"]
     assert list(report["smoothing 1"]) == list(KitchenEnv.layout.names)
-    # The oracle's score: whether the action moves the entity now or later on.
+    # The oracle's score: whether the action moves the entity.
     truth = environment.simulator(2)(data) > 0.5
     cabinet = KitchenEnv.layout.index("slide_cabinet")
     assert truth.shape == data["caiac", "score"].shape
-    for episode in data["episode"].unique():
-        rows = data["episode"] == episode
-        later = truth[rows].flip(0).cummax(0).values.flip(0)
-        assert torch.equal(data["oracle", "score"][rows].bool(), later)
+    assert torch.equal(data["oracle", "score"].bool(), truth)
     assert not truth[:, cabinet].any()
     assert truth[:, KitchenEnv.layout.index("microwave")].any()
 
@@ -126,17 +129,17 @@ def test_evaluation(cfg, steps):
         assert episode["success"] or episode["steps"] == 280
         assert "kettle" not in episode["wrong_tasks"]
     # It is not played again.
-    written = steps.parts.run_folder(cfg, "none", 0) / "evaluation" / "12.json"
+    written = steps.parts.run_folder(cfg, "none", 0) / "evaluation" / "test-12.json"
     kept = json.loads(written.read_text())
-    assert kept == evaluation.episodes
-    kept[0]["steps"] = -1
+    assert kept["episodes"] == evaluation.episodes
+    kept["episodes"][0]["steps"] = -1
     written.write_text(json.dumps(kept))
     (again,) = steps.evaluate.evaluate(cfg, "none", seed=0)
-    assert again.episodes == kept
+    assert again.episodes == kept["episodes"]
     other = cfg.copy()
     other.env.evaluate.episodes = 1
     with pytest.raises(ValueError, match=r"other settings.*\['episodes'\] differ"):
-        steps.evaluate.evaluate(other, "none", seed=0)
+        list(steps.evaluate.evaluate(other, "none", seed=0))
 
 
 def test_starts_of_the_splits_and_the_runs_differ(cfg, steps):
@@ -245,6 +248,7 @@ def test_offline_rl_learns_from_the_same_data(cfg, steps, compose):
     td3 = compose("learner=td3", "method=[caiac]", out=cfg.out)
     td3.env.truth = cfg.env.truth
     td3.env.evaluate.episodes = 1
+    td3.validation.policies = 1
     learner = steps.train.train(td3, "caiac", seed=11)
     batch = next(learner.batches())
     achieved = KitchenEnv.layout.achieved_goal(batch, next=True)
@@ -252,8 +256,8 @@ def test_offline_rl_learns_from_the_same_data(cfg, steps, compose):
     relabeled = batch["hindsight", "relabeled"][:, 0]
     assert relabeled.any()
     assert torch.equal(batch["next", "reward"][relabeled, 0], reward[relabeled])
-    evaluations = steps.evaluate.evaluate(td3, "caiac", seed=11)
-    assert len(evaluations[-1].episodes) == 1
+    *_, evaluation = steps.evaluate.evaluate(td3, "caiac", seed=11)
+    assert len(evaluation.episodes) == 1
 
 
 def test_estimators_are_compared_on_unseen_demonstrations(
@@ -276,23 +280,45 @@ def test_estimators_are_compared_on_unseen_demonstrations(
     assert len((tmp_path / "influence.csv").read_text().splitlines()) == 81
 
 
+@pytest.mark.parametrize("name", ["kitchen_all_tasks", "kitchen_any_start"])
+def test_chains_that_are_collected(name, tmp_path, steps, compose, monkeypatch):
+    cfg = compose(f"env={name}", "size=quick")
+    assert cfg.out == f"outputs/{name}_quick"
+    assert cfg.env.evaluate.tasks == ["kettle", "hinge_cabinet"]
+    assert cfg.env.evaluate.start == "random"
+    module = importlib.import_module("environments.kitchen")
+    asked = []
+
+    def play(dataset_id, **options):
+        asked.append((dataset_id, options["orders"], options["episodes"]))
+        raise InterruptedError
+
+    monkeypatch.setattr(module, "create_kitchen_play", play)
+    cfg.out = str(tmp_path)
+    environment = steps.parts.make_environment(cfg)
+    with pytest.raises(InterruptedError):
+        environment.collect()
+    expected = {
+        "kitchen_all_tasks": (PLAY_ID, PLAY_ORDERS, 1),
+        "kitchen_any_start": (PLAY_ANY_START_ID, PLAY_ANY_START_ORDERS, 1),
+    }
+    assert asked == [expected[name]]
+    cfg.env.collect.chains = "all"
+    with pytest.raises(ValueError, match=r"chains is 'all'.*'play_any_start'"):
+        environment.collect()
+
+
 def test_all_tasks(tmp_path, steps, compose, monkeypatch):
     """Chains instead of single tasks, through all the steps."""
-    cfg = compose("study=kitchen_all_tasks", "size=quick")
-    assert cfg.out == "outputs/kitchen_all_tasks_quick"
-    assert cfg.learner.window == 10
-    assert cfg.env.evaluate.tasks == ["kettle", "hinge_cabinet"]
-    cfg = compose("study=kitchen_all_tasks", out=tmp_path)
-    assert list(cfg.method) == ["none", "caiac", "oracle"]
+    overrides = ["env=kitchen_all_tasks", "method=[none,caiac,oracle]"]
+    cfg = compose(*overrides, out=tmp_path)
     cfg.env.collect.episodes = 1
     cfg.env.influence_episode = 0
     cfg.env.frames = ["kettle"]
     environment = steps.parts.make_environment(cfg)
     module = importlib.import_module("environments.kitchen")
-    play = functools.partial(
-        module.create_kitchen_play, orders=[("kettle", "slide cabinet")]
-    )
-    monkeypatch.setattr(module, "create_kitchen_play", play)
+    orders = [("kettle", "slide cabinet")]
+    monkeypatch.setitem(module.CHAINS, "play", (PLAY_ID, orders, 400))
     steps.collect.collect(cfg)
     data = load_transitions(tmp_path / "demonstrations")
     order = [KITCHEN_TASKS.index(task) for task in ("kettle", "slide_cabinet")]
@@ -318,16 +344,12 @@ def test_all_tasks(tmp_path, steps, compose, monkeypatch):
     monkeypatch.setattr("torchrl._THREAD_POOL_INIT", 64)
     threads = torch.get_num_threads()
     steps.train.train(cfg, "caiac", seed=0)
-    evaluations = steps.evaluate.evaluate(cfg, "caiac", seed=0)
+    (evaluation,) = steps.evaluate.evaluate(cfg, "caiac", seed=0)
+    assert len(evaluation.episodes) == 1
     moved = abs(starts[-1] - KitchenEnv.default_state()) > 1e-3
     columns = KitchenEnv.layout.columns
     assert moved[9:].any()
     assert not moved[list(columns["kettle"])].any()
     assert torch.get_num_threads() == threads
-    table = steps.study.report_table(cfg, report, {"caiac": 0.5}, evaluations)
-    assert "caiac        kettle" in table
-    assert "rows with a swap: caiac 50.0% (counterfactual: 80%)" in table
-    solved = sum(episode["success"] for episode in evaluations[0].episodes)
-    assert environment.answer(evaluations) == f"all tasks: {solved}/1 (caiac)"
     environment.draw(tmp_path, "small", threshold=0.2)
     assert (tmp_path / "small_influence.png").stat().st_size > 10_000

@@ -178,10 +178,7 @@ def test_learners_of_values_sample_all_episodes(steps, compose, cfg):
     small = {"out": cfg.out, "env": cfg.env}
     whole = compose("env=ogbench_cube_double_noisy", "learner=iql", "method=[none]")
     cfg = OmegaConf.merge(whole, small)
-    with pytest.raises(ValueError, match=r"learner.successful is 0.7.*null"):
-        made = steps.parts.make_learner(cfg, "none")
-        made.make_buffer(made.rows())
-    cfg.learner.successful = None
+    assert cfg.learner.successful is None and cfg.learner.gamma == 0.99
     made = steps.parts.make_learner(cfg, "none")
     rb = made.make_buffer(made.rows())
     batch = rb.sample()
@@ -189,6 +186,10 @@ def test_learners_of_values_sample_all_episodes(steps, compose, cfg):
     (goals,) = [t for t in rb.transform if type(t).__name__ == "HindsightGoal"]
     assert goals.future == 0.7 and goals.p == 0.01
     assert batch["hindsight", "relabeled"].float().mean() > 0.6
+    cfg.learner.successful = 0.7
+    made = steps.parts.make_learner(cfg, "none")
+    with pytest.raises(ValueError, match=r"learner.successful is 0.7.*null"):
+        made.make_buffer(made.rows())
 
 
 def test_rewards_are_ogbenchs_success():

@@ -143,6 +143,42 @@ def test_parameters_of_another(dtype, batch):
         torch.testing.assert_close(got, torch.stack(want), **tolerance)
 
 
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16])
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_normalised_layers(dtype, batch):
+    """Hidden units have mean 0 and variance 1 in each row, before their ReLU."""
+    torch.manual_seed(0)
+    features = GoalFeatures(LAYOUT, reference="arm").fit_statistics(rows(200))
+    pair = [
+        GoalConditionedCritic(
+            features, 3, (32, 16), hidden_dtype=dtype, layer_norm=True
+        )
+        for _ in range(2)
+    ]
+    td = rows(*batch)
+    wants = []
+    for critic in pair:
+        value = torch.cat([features(td.clone())["features"], td["action"]], -1)
+        parameters = list(critic.network.parameters())
+        for i in range(0, len(parameters), 2):
+            value = value @ parameters[i].T + parameters[i + 1]
+            if i + 2 < len(parameters):
+                deviation = value.var(-1, correction=0, keepdim=True).add(1e-5).sqrt()
+                value = ((value - value.mean(-1, keepdim=True)) / deviation).clamp_min(
+                    0
+                )
+        wants.append(value)
+    tolerance = {} if dtype is None else {"rtol": 0.05, "atol": 0.05}
+    got = pair[0](td.clone())["state_action_value"]
+    torch.testing.assert_close(got, wants[0], **tolerance)
+    stacked = torch.stack([TensorDict.from_module(x).data for x in pair])
+    got = pair[0](td.expand(2, *batch), stacked)["state_action_value"]
+    torch.testing.assert_close(got, torch.stack(wants), **tolerance)
+    with mock.patch.object(networks_module, "_on_cpu", return_value=False):
+        got = pair[0](td.expand(2, *batch), stacked)["state_action_value"]
+    torch.testing.assert_close(got, torch.stack(wants), **tolerance)
+
+
 def test_who_takes_parameters():
     class Other(GoalConditionedCritic):
         def forward(self, tensordict):

@@ -39,8 +39,10 @@ class GoalConditionedTD3Loss(TD3Loss):
       true: the time limit of an episode does not end the task.
     - The loss of the policy may have a penalty on actions and a behaviour cloning term
       (TD3+BC, Fujimoto & Gu 2021): ``-λ Q(s, g, π) + |π - a|² / A`` with
-      ``λ = bc_alpha / mean |Q|``. Transitions can be left out of the latter:
-      counterfactual ones contain the action of the expert before the swap.
+      ``λ = bc_alpha / mean |Q|``. Transitions can be left out of the latter, such as
+      random ones. Counterfactual ones contain the action of the expert before the
+      swap: it suits the swapped state too if the swap leaves out the entity that the
+      action is for (``CAIACTransform(lookahead="next")``).
     - The loss of the policy evaluates the first critic only.
     - Actions of the data outside of their bounds are an error: the policy cannot return
       them. The first ten calls are checked, on an accelerator only the first one, and
@@ -75,7 +77,7 @@ class GoalConditionedTD3Loss(TD3Loss):
             cloning term (TD3+BC: 2.5). Defaults to ``None``: no such term.
         bc_mask_key (NestedKey, optional): a bool leaf, ``[*B]`` or ``[*B, 1]``, true
             for the transitions to leave out of the behaviour cloning term, such as
-            ``("caiac", "counterfactual")``. Defaults to ``None``: none is left out.
+            those of failed episodes. Defaults to ``None``: none is left out.
         policy_noise (float): the standard deviation of the noise on the action of the
             target policy, in units of the action. Defaults to ``0.2``.
         noise_clip (float): the largest such noise. Defaults to ``0.5``.

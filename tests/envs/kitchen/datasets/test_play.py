@@ -8,6 +8,8 @@ import torch
 
 from torchrl_caiac.envs.kitchen import (
     KITCHEN_TASKS,
+    PLAY_ANY_START_ID,
+    PLAY_ANY_START_ORDERS,
     PLAY_ID,
     PLAY_ORDERS,
     KitchenEnv,
@@ -72,6 +74,50 @@ def test_orders_of_play_are_narrow_and_contain_all_tasks():
     # No counterfactual shows what never rests once it was moved.
     early = {task.replace(" ", "_") for order in PLAY_ORDERS for task in order[:-1]}
     assert early == tasks
+
+
+def test_orders_that_begin_with_any_task_are_balanced_and_narrow():
+    assert len(PLAY_ANY_START_ORDERS) == 7
+    for place in range(4):
+        tasks = {order[place].replace(" ", "_") for order in PLAY_ANY_START_ORDERS}
+        assert tasks == set(KITCHEN_TASKS)
+    for task in {task for order in PLAY_ANY_START_ORDERS for task in order}:
+        begun = {
+            frozenset(order[: order.index(task)])
+            for order in PLAY_ANY_START_ORDERS
+            if task in order
+        }
+        assert sorted(map(len, begun)) == [0, 1, 2, 3]
+        # Each contains the smaller ones.
+        assert all(a <= b or b <= a for a in begun for b in begun)
+
+
+def test_every_task_is_done_from_the_default_start(tmp_path):
+    dataset, report = create_kitchen_play(
+        PLAY_ANY_START_ID,
+        orders=PLAY_ANY_START_ORDERS,
+        episodes=1,
+        max_steps=440,
+        root=tmp_path,
+        workers=1,
+        progress=False,
+    )
+    assert report.collected == 7
+    rows = kitchen_transitions(dataset, progress=False)
+    default = torch.as_tensor(KitchenEnv.default_state())
+    for number, order in enumerate(PLAY_ANY_START_ORDERS):
+        own = rows[rows["episode"] == number]
+        torch.testing.assert_close(own["sim", "qpos"][0], default, atol=1e-6, rtol=0)
+        names = [name.replace(" ", "_") for name in order]
+        # A task that is undone is played again.
+        played = own["task"].unique_consecutive().tolist()
+        first = list(dict.fromkeys(KITCHEN_TASKS[task] for task in played))
+        assert first == names
+        last = own["next", "observation"][-1]
+        for name in names:
+            goal = torch.as_tensor(KitchenEnv.solved(name)).float()
+            columns = torch.tensor(KitchenEnv.layout.columns[name])
+            assert (last[columns] - goal).norm() < 0.3
 
 
 @pytest.mark.parametrize(
