@@ -34,7 +34,7 @@ SMALL_ENV = {
         "transformer": {"steps": 20, "eval_every": 10, "layers": 1, "width": 16},
         "score": {"num_actions": 8},
         "truth": {"actions": 4, "oracle_actions": 3},
-        "evaluate": {"episodes": 3, "last": 2, "curve_every": 4},
+        "evaluate": {"episodes": 3, "validation_episodes": 2},
     },
     "ogbench_cube_double": {
         "collect": {"episodes": 3, "steps": 40, "held_out": 2},
