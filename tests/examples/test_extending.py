@@ -141,6 +141,7 @@ def test_a_method_and_a_learner_of_one_file_each(tmp_path):
             "method=[caiac,swap_anything]",
             "size=quick",
             *(f"root={out}", "workers=1", "processes=1", "env.demonstrations=null"),
+            "env.collect.random_ratio=2.0",
             *("env.collect.expert=2", "env.collect.random=4", "env.collect.held_out=2"),
             *("env.collect.steps=100", "env.world_model.steps=20"),
             *("env.world_model.eval_every=10", "env.evaluate.episodes=1"),

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 import json
 import os
 import pickle
@@ -8,8 +7,8 @@ from functools import partial
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
-from torchrl_caiac._files import claim_folder
 from torchrl_caiac.envs import fetch_push_reward
 
 METHODS = ["caiac", "coda", "coda_action", "relabel_only", "none", "oracle"]
