@@ -28,7 +28,12 @@ from train import check_run, load_policy
 _LOGGER = logging.getLogger(__name__)
 
 
-def evaluate(cfg: DictConfig, method: str, seed: int) -> Iterator[Evaluation]:
+def evaluate(cfg: DictConfig, method: str, seed: int) -> list[Evaluation]:
+    """Returns all of :func:`evaluations`."""
+    return list(evaluations(cfg, method, seed))
+
+
+def evaluations(cfg: DictConfig, method: str, seed: int) -> Iterator[Evaluation]:
     """Evaluates the policies of a run: all on validation starts, then the best one.
 
     A run with one policy has nothing to choose, and is not validated. Of policies that

@@ -12,14 +12,14 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from hydra.utils import get_class
 
-from shared.results import Row, read_rows, state_of
+from shared.results import Row, read_rows, run_key, state_of
 from shared.studies import CONF, Run, Study, load_study
 from torchrl_caiac._figures import colour, finish_results, name_label, new_figure
 from torchrl_caiac._files import whole_file
@@ -27,7 +27,7 @@ from torchrl_caiac._files import whole_file
 __all__ = ["answer_study", "draw_study", "main", "report_study"]
 
 BASELINE = "none"  # differences are to this method
-RESAMPLES = 5000
+RESAMPLES = 2000
 
 
 class Estimate(NamedTuple):
@@ -52,9 +52,17 @@ class Estimate(NamedTuple):
 
 def estimate(values: np.ndarray) -> Estimate:
     """Returns the mean of values ``[seeds, tasks]`` and rliable's interval."""
+    return _estimate(tuple(map(tuple, values.tolist())))
+
+
+@cache  # tables and figures have the same ones
+def _estimate(rows: tuple[tuple[float, ...], ...]) -> Estimate:
+    values = np.array(rows)
     mean = float(values.mean())
     if len(values) == 1:
         return Estimate(mean, math.nan, math.nan)
+    if (values == values[:1]).all():  # every resample is the same
+        return Estimate(mean, mean, mean)
     if sys.version_info < (3, 11):  # for which there is no rliable: the same by hand
         seeds, tasks = values.shape
         draws = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds, tasks))
@@ -108,8 +116,8 @@ class Results:
                 f"study={study.name} stale=recompute"
             )
         known = {run.key for run in runs}
-        mine = [r for r in rows if (tuple(r.values())[:4]) in known]
-        return cls(study, runs, [row for row in mine if row["split"] == "test"])
+        tests = [row for row in rows if row["split"] == "test"]
+        return cls(study, runs, [row for row in tests if run_key(row) in known])
 
     @cached_property
     def groups(self) -> list[Group]:
@@ -184,7 +192,7 @@ def report_study(study: Study, runs: Sequence[Run], folder: Path) -> list[str]:
     }
     if any(len(names) > 1 for names in tasks.values()):
         lines += ["", *_task_table(results, tasks)]
-    done = {tuple(row.values())[:4] for row in results.rows}
+    done = {run_key(row) for row in results.rows}
     missing = len(runs) - len(done)
     ended = (
         f"All {len(runs)} runs are done."

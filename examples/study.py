@@ -38,7 +38,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from collect import collect
-from evaluate import evaluate
+from evaluate import evaluations
 from figures import answer_study, draw_study, report_study
 from fit import fit
 from score import score
@@ -227,7 +227,7 @@ def run(job: Run, table: Path, commit: str) -> str:
             write_json(folder / "settings.json", run_settings(cfg, method))
             train(cfg, method, seed)
             environment, seconds = make_environment(cfg), train_seconds(folder)
-            for evaluation in evaluate(cfg, method, seed):
+            for evaluation in evaluations(cfg, method, seed):
                 common = {
                     "setting": job.setting,
                     "learner": job.learner,

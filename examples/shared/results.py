@@ -15,7 +15,15 @@ from filelock import FileLock
 from shared.studies import Run
 from torchrl_caiac._files import whole_file
 
-__all__ = ["COLUMNS", "add_rows", "read_rows", "remove_runs", "state_of", "unlisted"]
+__all__ = [
+    "COLUMNS",
+    "add_rows",
+    "read_rows",
+    "remove_runs",
+    "run_key",
+    "state_of",
+    "unlisted",
+]
 
 COLUMNS = (
     *("setting", "learner", "method", "seed", "step", "split", "task", "measure"),

@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,17 @@ from omegaconf import DictConfig, OmegaConf
 from shared.parts import make_method
 from torchrl_caiac._files import plain
 
-__all__ = ["Answer", "Arm", "Run", "Study", "ad_hoc_study", "compose", "load_study"]
+__all__ = [
+    "Answer",
+    "Arm",
+    "Run",
+    "Study",
+    "ad_hoc_study",
+    "compose",
+    "digest",
+    "load_study",
+    "run_settings",
+]
 
 CONF = Path(__file__).parents[1] / "conf"
 # Settings of an environment on which no result depends.
@@ -130,19 +141,17 @@ class Study:
             ValueError: a run occurs twice.
         """
         order = list(self.settings)
-        composed: dict[tuple[Any, ...], list[Run]] = {}
+        runs: list[Run] = []
         for arm in self.arms:
             for setting in arm.settings or order:
-                composed[arm, setting] = list(self._runs_of(arm, setting))
-        runs = [run for part in composed.values() for run in part]
+                runs += self._runs_of(arm, setting)
         twice = [k for k, n in Counter(run.key for run in runs).items() if n > 1]
         if twice:
             raise ValueError(
                 f"the study {self.name} has the run {twice[0]} twice: each setting, "
                 "learner, method and seed may be in one arm only"
             )
-        seeds = {id(run): run.seed for run in runs}
-        return sorted(runs, key=lambda run: seeds[id(run)])  # stable
+        return sorted(runs, key=attrgetter("seed"))  # else in the same order
 
     def _runs_of(self, arm: Arm, setting: str) -> list[Run]:
         protocol = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import csv
 import os
 import subprocess
 import sys
@@ -140,10 +140,10 @@ def test_a_method_and_a_learner_of_one_file_each(tmp_path):
             "learner=cloning",
             "method=[caiac,swap_anything]",
             "size=quick",
-            f"out={out}",
-            *("workers=1", "study.processes=1"),
+            *(f"root={out}", "workers=1", "processes=1", "env.demonstrations=null"),
+            "env.collect.random_ratio=2.0",
             *("env.collect.expert=2", "env.collect.random=4", "env.collect.held_out=2"),
-            *("env.collect.steps=20", "env.world_model.steps=20"),
+            *("env.collect.steps=100", "env.world_model.steps=20"),
             *("env.world_model.eval_every=10", "env.evaluate.episodes=1"),
         ],
         capture_output=True,
@@ -156,7 +156,12 @@ def test_a_method_and_a_learner_of_one_file_each(tmp_path):
     assert run.stderr == ""
     lines = run.stdout.rstrip().splitlines()
     assert all(line.startswith(f"[{n}/5] ") for n, line in enumerate(lines[:5], 1))
-    assert lines[-1].startswith("both cubes at their goals: ")
-    assert lines[-1].endswith("% (swap_anything)")
-    results = json.loads((out / "fetch_push.json").read_text())["results"]
-    assert [r["method"] for r in results] == ["caiac", "swap_anything"]
+    assert lines[-1].startswith("two cubes pushed to their goals: ")
+    assert lines[-1].endswith("/1 (swap_anything)")
+    table = out / "studies" / "fetch_push_cloning_quick" / "fetch_push_cloning.csv"
+    with table.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["measure"] == "full"]
+    assert {r["method"] for r in rows} == {"caiac", "swap_anything"}
+    assert [(r["seed"], r["step"], r["split"]) for r in rows] == [
+        ("0", "20", "test")
+    ] * 2

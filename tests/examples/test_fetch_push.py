@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 import json
 import os
 import pickle
@@ -8,8 +7,8 @@ from functools import partial
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
-from torchrl_caiac._files import claim_folder
 from torchrl_caiac.envs import fetch_push_reward
 
 METHODS = ["caiac", "coda", "coda_action", "relabel_only", "none", "oracle"]
@@ -19,7 +18,7 @@ METHODS = ["caiac", "coda", "coda_action", "relabel_only", "none", "oracle"]
 def cfg(steps, compose, tmp_path_factory):
     """A small run up to the scores."""
     cfg = compose(
-        "study=fetch_push",
+        *("env=fetch_push", "learner=td3"),
         f"method=[{','.join(METHODS)}]",
         out=tmp_path_factory.mktemp("fetch_push"),
     )
@@ -215,7 +214,7 @@ def test_no_file_of_a_run_can_run_code(cfg, environment, steps, tmp_path):
         ("checkpoint.zip", steps.train.train),
         ("policies/8.pt", partial(steps.train.load_policy, step=8)),
         ("train.json", steps.evaluate.evaluate),
-        ("evaluation/8.json", steps.evaluate.evaluate),
+        ("evaluation/validation-8.json", steps.evaluate.evaluate),
     ):
         file = folder / name
         whole = file.read_bytes()
@@ -236,7 +235,7 @@ def test_other_settings_are_not_mixed(cfg, steps):
         ({"env": {"augmentation": {"threshold": 0.1}}}, "augmentation.threshold"),
         ({"method": {"caiac": {"threshold": 0.1}}}, "method.threshold"),
     ):
-        other = steps.study.OmegaConf.merge(cfg, change)
+        other = OmegaConf.merge(cfg, change)
         with pytest.raises(ValueError, match=f"other settings.*{name}.* differ"):
             steps.train.train(other, "caiac", seed=1)
         with pytest.raises(ValueError, match=f"other settings.*{name}.* differ"):
@@ -302,78 +301,6 @@ def test_rows_mixed_from_other_episodes_are_refused(cfg, environment, steps):
         file.write_text(content)
 
 
-def test_the_study(cfg, steps, compose, tmp_path, monkeypatch, capfd):
-    study = steps.study
-    cfg = cfg.copy()
-    cfg.method = {name: cfg.method[name] for name in ("caiac", "none")}
-    cfg.study.seeds = [0, 1]
-    cfg.study.publish = str(tmp_path / "published")
-
-    def one_after_the_other(function, jobs, *, processes):
-        assert processes == cfg.study.processes
-        for number in reversed(range(len(jobs))):
-            yield number, function(*jobs[number])
-
-    monkeypatch.setattr(study, "run_in_processes", one_after_the_other)
-    with steps.console.Console(cfg.out, stages=5) as console:
-        study.run_study(cfg, console)
-    out = steps.parts.make_environment(cfg).out
-    for name in ("fetch_push.csv", "fetch_push.txt"):
-        content = (out / name).read_bytes()
-        assert (tmp_path / "published" / name).read_bytes() == content
-    for name in ("fetch_push_success.png", "fetch_push_curves_1.png"):
-        content = (out / "figures" / name).read_bytes()
-        assert (tmp_path / "published" / name).read_bytes() == content
-    table = (out / "fetch_push.txt").read_text()
-    assert "mean of the policies from step 8 to 12" in table
-    with (out / "fetch_push.csv").open() as file:
-        results = list(csv.DictReader(file))
-    assert list(results[0]) == [
-        *("fraction", "method", "seed", "step"),
-        *("full", "cube0", "cube1", "final"),
-    ]
-    # In the order of the jobs, whatever their order of finishing.
-    assert [(r["seed"], r["method"], r["step"]) for r in results] == [
-        (seed, method, step)
-        for seed in "01"
-        for method in ("caiac", "none")
-        for step in ("4", "8", "12")
-    ]
-    for result in results:
-        full, *cubes = (float(result[k]) for k in ("full", "cube0", "cube1"))
-        assert float(result["final"]) <= full <= min(cubes)
-    # Stages, the table, and the answer in the last line; nothing else.
-    printed = capfd.readouterr()
-    assert printed.err == ""
-    lines = printed.out.rstrip().splitlines()
-    stages = ("episodes", "world model", "scores", "training", "figures")
-    for number, (line, stage) in enumerate(zip(lines, stages, strict=False), start=1):
-        assert line.startswith(f"[{number}/5] {stage}") and line.endswith(" s")
-    assert "\n".join(lines[6:-2]).rstrip() == table.rstrip()
-    full = {
-        name: [
-            float(r["full"])
-            for r in results
-            if r["method"] == name and r["step"] in ("8", "12")
-        ]
-        for name in ("none", "caiac")
-    }
-    shares = [f"{25 * sum(full[name]):.1f} %" for name in ("none", "caiac")]
-    assert lines[-1] == (
-        f"both cubes at their goals: {shares[0]} without, {shares[1]} with "
-        "counterfactuals"
-    )
-    # Played once; from then on read.
-    monkeypatch.setattr(type(steps.parts.make_environment(cfg)), "play", None)
-    again = steps.evaluate.evaluate(cfg, "none", 1)
-    rows = study.result_rows(cfg, again)
-    assert [f"{r['full']}" for r in rows] == [r["full"] for r in results[-3:]]
-    other = cfg.copy()
-    other.env.evaluate.seed = 5
-    with pytest.raises(ValueError, match="other settings"):
-        steps.evaluate.evaluate(other, "none", 1)
-
-
 def test_motor_plans_learn_from_the_same_data(cfg, steps, compose):
     """A learner is not tied to an environment."""
     lmp = compose("env=fetch_push", "learner=lmp", "method=[caiac]", out=cfg.out)
@@ -428,25 +355,17 @@ def test_suggested_thresholds_are_compared_with_the_best(
     assert environment.held_out().get("suggested", None) is None
 
 
-def test_a_run_that_another_process_has_begun(cfg, steps):
-    with (
-        claim_folder(steps.parts.run_folder(cfg, "none", 9)),
-        pytest.raises(RuntimeError, match=r"none-seed9"),
-    ):
-        steps.study.run(cfg, "none", 9)
-
-
-def test_policies_that_are_evaluated(cfg, steps, compose):
-    policy_steps = steps.parts.policy_steps
-    assert policy_steps(cfg) == [4, 8, 12]
-    full = compose("study=fetch_push")
-    assert policy_steps(full) == [
-        *(12_000, 24_000, 36_000, 44_000, 48_000, 52_000, 56_000, 60_000)
-    ]
-    assert policy_steps(compose("study=demo")) == [2000]
-    full.learner.steps = 3000
-    with pytest.raises(ValueError, match=r"learner\.steps is 3000, expected at least"):
-        policy_steps(full)
+def test_policies_that_are_compared(cfg, steps, compose):
+    candidates = steps.parts.candidates
+    assert candidates(cfg) == [4, 8, 12]
+    cfg = cfg.copy()
+    for number, found in ((1, [12]), (2, [8, 12]), (5, [4, 8, 12]), (None, [4, 8, 12])):
+        cfg.validation.policies = number
+        assert candidates(cfg) == found
+    assert candidates(compose("env=kitchen", "learner=lmp")) == [2000]
+    cfg.learner.steps = 3
+    with pytest.raises(ValueError, match=r"learner\.steps is 3, expected at least"):
+        candidates(cfg)
 
 
 def test_starts_are_shared_and_fresh(cfg, environment, steps):

@@ -133,7 +133,7 @@ title: nothing
 collect: {rows: 4, seed: 0}
 score: {batch_size: 1, smoothing: 1}
 world_model: {steps: 1}
-augmentation: {counterfactual_ratio: 0.5}
+augmentation: {counterfactual_ratio: 0.5, threshold: 0.5}
 evaluate: {episodes: 5, validation_episodes: 4}
 """,
     "conf/learner/counting.yaml": """
@@ -154,7 +154,10 @@ other:
 STUDY = {
     "name": "try",
     "title": "trying",
-    "settings": {"4": ["env=tiny"], "8": ["env=tiny", "env.collect.rows=8"]},
+    "settings": {
+        "4": ["env=tiny"],
+        "8": ["env=tiny", "env.folder=tiny8", "env.collect.rows=8"],
+    },
     "arms": [
         {"learner": "counting", "methods": ["none", "other"], "seeds": [0, 1]},
     ],
@@ -320,12 +323,15 @@ class TestAnEditedStudy:
 
     def test_some_settings_and_seeds(self, study):
         study.run()
-        settings = {**STUDY["settings"], "8": ["env=tiny", "env.collect.rows=9"]}
+        settings = {
+            **STUDY["settings"],
+            "8": ["env=tiny", "env.folder=tiny9", "env.collect.rows=9"],
+        }
         study.write(settings=settings)
         with pytest.raises(ValueError, match="4 runs"):
             study.run()
         kept = [row for row in study.rows() if row["setting"] == "4"]
-        study.run("stale=recompute", f"root={study.folder / 'new'}")
+        study.run("stale=recompute")
         assert [row for row in study.rows() if row["setting"] == "4"] == kept
         assert cells(study.rows()) == expected()
         # No seed is dropped without a word.
@@ -356,10 +362,10 @@ def test_a_run_that_fails_leaves_the_others(study):
 
 @pytest.mark.slow
 def test_a_killed_study_resumes(study):
-    process = study.start(sleep=0.02)
+    process = study.start("processes=0", sleep=0.02)
     try:
         deadline = time.monotonic() + 120
-        # In the middle of the runs: one has results, and others have checkpoints.
+        # In the middle of the runs: the first one has results.
         while not study.table.exists():
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.02)
@@ -376,7 +382,7 @@ def test_a_killed_study_resumes(study):
 
 @pytest.mark.slow
 def test_two_processes_share_a_study(study):
-    processes = [study.start("processes=1", sleep=0.02) for _ in range(2)]
+    processes = [study.start("processes=0", sleep=0.02) for _ in range(2)]
     outputs = [process.communicate(timeout=240)[0] for process in processes]
     assert [process.returncode for process in processes] == [0, 0], outputs
     assert cells(study.rows()) == expected()
