@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, StorageEnsemble, TensorStorage
 
 from torchrl_caiac._fingerprints import fingerprint_key
-from torchrl_caiac._torchrl import storage_revision, storage_rows
+from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.influence.score_record import read_record
@@ -228,7 +228,7 @@ class Lookahead:
         """
         storage = source.storage if isinstance(source, ReplayBuffer) else source
         data = storage_rows(storage, "the storage of the buffer that samples")
-        with _BUILDING:
+        with _BUILDING, writes_paused(source):
             revision = storage_revision(storage)
             built = self._tables.get(storage)
             if built is None or built[0] != revision:
@@ -305,7 +305,8 @@ class Lookahead:
             raise RuntimeError(
                 "the batch does not have the rows that the buffer drew, so that the "
                 "trajectories of its rows are unknown: append this transform before "
-                "others that select, repeat or reorder rows, or leave out lookahead"
+                "others that select, repeat or reorder rows, leave out prefetch if "
+                "rows are replaced while batches are prefetched, or leave out lookahead"
             )
         return pick_rows(table, rows).to(device)
 
