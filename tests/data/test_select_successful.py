@@ -35,7 +35,7 @@ EPISODE, SUCCESS = [0, 1, 0, 1, 0, 1], [False, False, True, False, True, False]
 
 
 def flags(rows: TensorDict, *key: str) -> list[int]:
-    return rows["next", *key].reshape(-1).int().tolist()
+    return rows[("next", *key)].reshape(-1).int().tolist()
 
 
 def slow_rows(
@@ -144,7 +144,7 @@ def test_numbers_are_compared() -> None:
     found = select_successful(data, ("next", "reward"), above=-0.5)
     assert found["row"].tolist() == [0, 2]
     assert select_successful(data, above=0.5)["row"].tolist() == [0, 2]
-    with pytest.raises(ValueError, match="values from -1 to 0.*pass above="):
+    with pytest.raises(ValueError, match=r"values from -1 to 0.*pass above="):
         select_successful(data, ("next", "reward"))
     data["next", "reward"][3] = torch.nan
     with pytest.raises(ValueError, match=r"'reward'\) in row 3 is nan.*unknown"):
@@ -162,9 +162,9 @@ def test_other_data_are_refused() -> None:
     assert select_successful(data[2:3])["row"].tolist() == [2]
     rb = ReplayBuffer(storage=LazyTensorStorage(6))
     rb.extend(data)
-    with pytest.raises(TypeError, match="ReplayBuffer.*from_replay_buffer"):
+    with pytest.raises(TypeError, match=r"ReplayBuffer.*from_replay_buffer"):
         select_successful(rb)
-    with pytest.raises(ValueError, match="trajectories must be .* at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"trajectories must be .* at least 1, got 0"):
         select_successful(data, trajectories=0)
     with pytest.raises(KeyError, match="name the one they have with key="):
         select_successful(data, "solved")
