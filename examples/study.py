@@ -291,13 +291,20 @@ def missing_runs(options: Options, runs: Sequence[Run]) -> list[Run]:
 
 
 def preparations(runs: Sequence[Run]) -> list[DictConfig]:
-    """Returns the configurations that runs need prepared, with all of their methods."""
+    """Returns the configurations that runs need prepared, with the methods of these."""
     by_data: dict[str, DictConfig] = {}
     for run in runs:
         needs = {**_preparation(run.cfg), "methods": None}
-        found = by_data.setdefault(digest(needs), run.cfg.copy())
-        found.method = OmegaConf.merge(found.method, run.cfg.method)
+        found = by_data.setdefault(digest(needs), _with_methods(run.cfg, {}))
+        mine = {**found.method, run.method: run.cfg.method[run.method]}
+        by_data[digest(needs)] = _with_methods(found, mine)
     return list(by_data.values())
+
+
+def _with_methods(cfg: DictConfig, methods: dict[str, Any]) -> DictConfig:
+    changed = cfg.copy()
+    changed.method = methods
+    return changed
 
 
 def run_study(options: Options, console: Console) -> None:

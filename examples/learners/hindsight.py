@@ -81,8 +81,10 @@ class HindsightLearner(GoalConditioned):
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of transitions, counterfactuals, and hindsight goals.
 
-        Without augmentation there are as many random goals as counterfactuals would
-        have (A.5.2).
+        Half of the counterfactuals have goals that others achieve. Without augmentation
+        there are as many random goals as counterfactuals would have (A.5.2). With the
+        setting ``random_goals: false`` there are none: no action explains them, which
+        matters to a learner that repeats actions.
         """
         environment = self.environment
         if environment.reward_fn is None:
@@ -93,10 +95,12 @@ class HindsightLearner(GoalConditioned):
             )
         augmentation = self.counterfactuals()
         ratio = self.augmentation.counterfactual_ratio
+        random = 0.5 if self.settings.get("random_goals", True) else 0.0
         goals = HindsightGoal(
             environment.layout,
             environment.reward_fn,
-            random=0.5 * ratio if augmentation is None else 0.0,
+            random=random * ratio if augmentation is None else 0.0,
+            counterfactual=random,
             **self.augmentation.get("hindsight", {}),
         )
         options: dict[str, Any] = {}

@@ -326,6 +326,23 @@ def test_targets_have_no_gradient(learner, configure, steps):
     assert with_gradient == {"qvalue_network"}
 
 
+@pytest.mark.parametrize("method", ["motion", "none"])
+def test_no_goals_of_other_rows(method, configure, steps):
+    """Only real rows are relabelled, with goals of their own future."""
+    cfg = configure("fetch_push", "iql", "learner.batch_size=64", method=method)
+    made = make(steps, cfg)
+    batch = next(made.batches())
+    moved = batch["hindsight", "relabeled"]
+    flags = batch.get(("caiac", "counterfactual"), torch.zeros_like(moved))
+    assert moved.any() and not (moved & flags).any()
+    rows = made.rows()
+    achieved = made.environment.layout.achieved_goal(rows, next=True)
+    for row in batch[moved.squeeze(-1)].unbind(0):
+        own = (rows["action"] == row["action"]).all(-1).nonzero().item()
+        goal = (achieved == row["desired_goal"]).all(-1).nonzero().item()
+        assert rows["episode"][own] == rows["episode"][goal] and goal >= own
+
+
 def test_values_need_rewards(configure, steps, monkeypatch):
     cfg = configure("fetch_push", "iql")
     kind = type(steps.parts.make_environment(cfg))

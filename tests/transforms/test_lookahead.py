@@ -1,0 +1,308 @@
+"""Lookahead against a slow search along trajectories."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    SliceSampler,
+    TensorDictReplayBuffer,
+)
+
+from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac.influence import score_buffer
+from torchrl_caiac.trajectories import trajectory_index
+from torchrl_caiac.transforms.lookahead import (
+    NEVER,
+    locked_entities,
+    steps_to_influence,
+)
+
+LAYOUT = EntityLayout({"arm": [0], "cup": [1], "lid": [2]}, fixed=["arm"])
+
+
+def slow_steps(influenced: list[list[bool]], episode: list[int]) -> list[list[int]]:
+    """Looks at each later row with the same episode, one by one."""
+    found = []
+    for row, own in enumerate(episode):
+        later = [r for r in range(row, len(episode)) if episode[r] == own]
+        found.append(
+            [
+                next((n for n, r in enumerate(later) if influenced[r][entity]), NEVER)
+                for entity in range(len(influenced[0]))
+            ]
+        )
+    return found
+
+
+def slow_locked(steps: list[int], rule: int | str, fixed: set[int]) -> list[bool]:
+    """Says of one row what it locks."""
+    if rule == "next":
+        known = [s for n, s in enumerate(steps) if n not in fixed and s < NEVER]
+        return [s == 0 or s in [min(known, default=-1)] for s in steps]
+    return [s <= rule for s in steps]
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> tuple[list[list[bool]], list[int]]:
+    """Draws which entities are influenced, and the episode of each row, interleaved."""
+    rows = draw(st.integers(1, 25))
+    row = st.lists(st.booleans(), min_size=3, max_size=3)
+    influenced = draw(st.lists(row, min_size=rows, max_size=rows))
+    episode = draw(st.lists(st.integers(0, 2), min_size=rows, max_size=rows))
+    return influenced, episode
+
+
+@given(recordings())
+@settings(max_examples=60, deadline=None)
+def test_steps_are_those_of_a_slow_search(recording) -> None:
+    influenced, episode = recording
+    index = trajectory_index(
+        TensorDict({"episode": torch.tensor(episode)}, [len(episode)])
+    )
+    found = steps_to_influence(torch.tensor(influenced), index)
+    assert found.tolist() == slow_steps(influenced, episode)
+
+
+@given(recordings(), st.sampled_from(["next", 0, 1, 5]))
+@settings(max_examples=60, deadline=None)
+def test_locked_entities_are_those_of_a_slow_search(recording, rule) -> None:
+    influenced, episode = recording
+    steps = slow_steps(influenced, episode)
+    found = locked_entities(torch.tensor(steps), rule, ~LAYOUT.fixed_mask)
+    assert found.tolist() == [slow_locked(row, rule, {0}) for row in steps]
+
+
+def make_rows(influenced: torch.Tensor, episode: torch.Tensor) -> TensorDict:
+    """Rows whose states name their places, with scores of 1 where influenced."""
+    state = torch.arange(float(3 * len(episode))).view(-1, 3)
+    return TensorDict(
+        {
+            "observation": state,
+            ("next", "observation"): state + 3,
+            "episode": episode,
+            ("caiac", "score"): influenced.float(),
+        },
+        [len(episode)],
+    )
+
+
+def make_influenced(rows: int = 120, length: int = 20) -> tuple[torch.Tensor, ...]:
+    generator = torch.Generator().manual_seed(0)
+    influenced = torch.rand(rows, 3, generator=generator) < 0.1
+    return influenced, torch.arange(rows) // length
+
+
+@pytest.mark.parametrize("lookahead", ["next", 0, 3])
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
+@pytest.mark.parametrize("window", [1, 4])
+@pytest.mark.parametrize("buffer", [False, True])
+def test_swaps_keep_what_is_locked(lookahead, storage, window, buffer) -> None:
+    influenced, episode = make_influenced()
+    steps = slow_steps(influenced.tolist(), episode.tolist())
+    locked = torch.tensor([slow_locked(row, lookahead, {0}) for row in steps])
+    rows = make_rows(influenced, episode)
+    options = {"batch_size": 64}
+    if window > 1:
+        options["sampler"] = SliceSampler(slice_len=window, traj_key="episode")
+    rb = TensorDictReplayBuffer(storage=storage(len(rows)), **options)
+    rb.extend(rows)
+    donors = None
+    if buffer:
+        donors = ReplayBuffer(storage=LazyTensorStorage(len(rows)))
+        donors.extend(rows)
+    transform = CAIACTransform(
+        LAYOUT,
+        counterfactual_ratio=1.0,
+        lookahead=lookahead,
+        window=window,
+        donors=donors,
+    )
+    rb.append_transform(transform)
+    swaps = 0
+    for _ in range(15):
+        batch = rb.sample()
+        place = (batch["observation"] / 3).floor().long()  # the row of each column
+        own = place[:, 0]  # the arm stays
+        changed = place != own.unsqueeze(-1)
+        assert not (changed & ~batch["caiac", "swapped"]).any()
+        # Neither the row nor the donor locks the entity, in any row of the window.
+        mine, theirs = locked[own], locked.gather(0, place)
+        assert not (changed & (mine | theirs)).any()
+        assert not (changed & influenced[own]).any()
+        swaps += int(changed.sum())
+    assert swaps > 0
+
+
+def test_windows_are_free_until_the_lookahead_after_them() -> None:
+    influenced = torch.zeros(20, 3, dtype=torch.bool)
+    influenced[10, 1] = True
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(20),
+        sampler=SliceSampler(slice_len=4, traj_key="episode"),
+        batch_size=400,
+    )
+    rb.extend(make_rows(influenced, torch.zeros(20, dtype=torch.long)))
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead=2, window=4))
+    batch = rb.sample()
+    first = (batch["observation"][::4, 0] / 3).long()
+    swapped = batch["caiac", "swapped"][::4, 1]
+    # The last row of a window that starts at row 5 is row 8, two before the influence.
+    assert set(first[swapped].tolist()) == {0, 1, 2, 3, 4, 11, 12, 13, 14, 15, 16}
+
+
+def test_graphs_lock_whole_components() -> None:
+    rows = 40
+    graph = torch.zeros(rows, 4, 3)
+    graph[30, 3, 1] = 1.0  # the action moves the cup
+    graph[:, 1, 2] = 1.0  # on which the lid lies
+    data = make_rows(torch.zeros(rows, 3), torch.arange(rows) // 20)
+    data["coda", "graph"] = graph
+    rb = ReplayBuffer(storage=LazyTensorStorage(rows), batch_size=64)
+    rb.extend(data)
+    rb.append_transform(CoDATransform(LAYOUT, 0.2, 1.0, lookahead="next"))
+    batch = rb.sample()
+    own = (batch["observation"][:, 0] / 3).long()
+    swapped = batch["caiac", "swapped"]
+    assert not swapped[(own >= 20) & (own <= 30)].any()
+    assert swapped[own < 20][:, 1:].all() and swapped[own > 30][:, 1:].all()
+
+
+def test_an_entity_that_is_never_swapped_does_not_come_next() -> None:
+    influenced, episode = torch.zeros(10, 3, dtype=torch.bool), torch.zeros(10).long()
+    influenced[9, 2] = True
+    rb = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=64)
+    rb.extend(make_rows(influenced, episode))
+    thresholds = {"cup": -1.0, "lid": 0.05}
+    rb.append_transform(CAIACTransform(LAYOUT, thresholds, 1.0, lookahead="next"))
+    assert not rb.sample()["caiac", "swapped"].any()  # the lid comes next in all rows
+
+
+def score_by(rb: ReplayBuffer, lookahead: int) -> None:
+    class Height:
+        layout = LAYOUT
+
+        def __call__(self, td: TensorDict) -> torch.Tensor:
+            return (td["observation"] == 30).float()  # the arm's column of row 10
+
+    score_buffer(rb, Height(), lookahead=lookahead, progress=False, check=False)
+
+
+def test_lookahead_counts_that_of_the_scores() -> None:
+    rows = make_rows(torch.zeros(20, 3), torch.zeros(20).long()).exclude("caiac")
+    rows["observation"][:, 1] = rows["next", "observation"][:, 1] = 0.0
+    rows["observation"][10, 1] = rows["next", "observation"][9, 1] = 30.0
+    rb = ReplayBuffer(storage=LazyTensorStorage(20), batch_size=200)
+    rb.extend(rows)
+    score_by(rb, 2)
+    transform = CAIACTransform(LAYOUT, 0.05, 1.0, lookahead=4)
+    rb.append_transform(transform)
+    batch = rb.sample()
+    own = (batch["observation"][:, 0] / 3).long()
+    assert set(own[~batch["caiac", "swapped"][:, 1]].tolist()) == {6, 7, 8, 9, 10}
+    other = ReplayBuffer(storage=rb.storage, batch_size=4)
+    other.append_transform(CAIACTransform(LAYOUT, lookahead=1))
+    with pytest.raises(ValueError, match=r"lookahead is 1.*those of 2 later states"):
+        other.sample()
+
+
+def test_new_rows_are_looked_at() -> None:
+    influenced, episode = torch.zeros(10, 3, dtype=torch.bool), torch.zeros(10).long()
+    rb = ReplayBuffer(storage=LazyTensorStorage(40), batch_size=200)
+    rb.extend(make_rows(influenced, episode))
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    assert rb.sample()["caiac", "swapped"][:, 1:].all()
+    influenced[9, 1] = True
+    later = make_rows(influenced, episode)
+    later["observation"] += 1000.0
+    rb.extend(later)  # the same trajectory goes on
+    assert not rb.sample()["caiac", "swapped"][:, 1].any()
+
+
+def test_scores_of_other_states_count_as_influenced() -> None:
+    rows = make_rows(torch.zeros(20, 3), torch.arange(20) // 10).exclude("caiac")
+    rows["observation"][:, 1] = rows["next", "observation"][:, 1] = 0.0
+    rb = ReplayBuffer(storage=LazyTensorStorage(20), batch_size=200)
+    rb.extend(rows)
+    score_by(rb, 0)
+    rb.storage[:]["observation"][9, 2] += 0.5  # not through the buffer
+    rb.append_transform(
+        CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next", unscored="keep")
+    )
+    batch = rb.sample()
+    own = (batch["observation"][:, 0] / 3).long()
+    assert not batch["caiac", "swapped"][own < 10].any()
+    assert batch["caiac", "swapped"][own >= 10][:, 1:].all()
+
+
+def test_prefetched_batches_are_those_of_their_rows() -> None:
+    influenced, episode = make_influenced()
+    rb = ReplayBuffer(storage=LazyTensorStorage(120), batch_size=32, prefetch=3)
+    rb.extend(make_rows(influenced, episode))
+    rb.append_transform(CAIACTransform(LAYOUT, lookahead="next"))
+    for _ in range(20):
+        rb.sample()
+
+
+def test_other_batches_are_refused() -> None:
+    influenced, episode = make_influenced()
+    rows = make_rows(influenced, episode)
+    transform = CAIACTransform(LAYOUT, lookahead="next")
+    with pytest.raises(RuntimeError, match=r"not sampled from a buffer.*rb.sample\(\)"):
+        transform(rows)
+    for change in (lambda td: td[:5], lambda td: td.flip(0)):
+        rb = ReplayBuffer(storage=LazyTensorStorage(120), batch_size=32)
+        rb.extend(rows)
+        rb.append_transform(change)
+        rb.append_transform(copy.deepcopy(transform))
+        with pytest.raises(RuntimeError, match="the rows that the buffer drew"):
+            rb.sample()
+    rb = ReplayBuffer(storage=LazyTensorStorage(120), batch_size=32)
+    rb.extend(rows.exclude("episode"))
+    rb.append_transform(transform)
+    with pytest.raises(KeyError, match="trajectory ids"):
+        rb.sample()
+
+
+@pytest.mark.parametrize("lookahead", [1.5, True, "goal", [1]])
+def test_wrong_types_are_refused(lookahead) -> None:
+    with pytest.raises(TypeError, match="lookahead must be"):
+        CAIACTransform(LAYOUT, lookahead=lookahead)
+
+
+def test_negative_numbers_are_refused() -> None:
+    with pytest.raises(ValueError, match="lookahead is -1"):
+        CAIACTransform(LAYOUT, lookahead=-1)
+
+
+def test_copies_and_pickles_build_their_own_tables() -> None:
+    influenced, episode = make_influenced()
+    rb = ReplayBuffer(storage=LazyTensorStorage(120), batch_size=32)
+    rb.extend(make_rows(influenced, episode))
+    rb.append_transform(CAIACTransform(LAYOUT, lookahead="next"))
+    rb.sample()
+    for other in (copy.deepcopy(rb), pickle.loads(pickle.dumps(rb))):
+        torch.manual_seed(0)
+        assert other.sample()["caiac", "swapped"].any()
+    assert "lookahead='next'" in repr(rb.transform[0])
+
+
+def test_the_rule_needs_no_number() -> None:
+    # Whatever the pace of a recording, the cup that the arm moves to is not swapped.
+    for pace in (1, 5, 25):
+        influenced = torch.zeros(3 * pace, 3, dtype=torch.bool)
+        influenced[-1, 1] = True
+        rb = ReplayBuffer(storage=LazyTensorStorage(3 * pace), batch_size=100)
+        rb.extend(make_rows(influenced, torch.zeros(3 * pace).long()))
+        rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+        swapped = rb.sample()["caiac", "swapped"]
+        assert not swapped[:, 1].any() and swapped[:, 2].all()
