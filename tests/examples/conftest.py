@@ -29,7 +29,8 @@ SMALL_ENV = {
         "evaluate": {"episodes": 2, "tasks": ["kettle"]},
     },
     "fetch_push": {
-        "collect": {"expert": 3, "random": 7, "held_out": 2, "steps": 40},
+        "demonstrations": 3,
+        "collect": {"expert": 4, "random": 7, "held_out": 2, "steps": 100},
         "world_model": {"steps": 60, "eval_every": 30, "hidden_sizes": [32]},
         "transformer": {"steps": 20, "eval_every": 10, "layers": 1, "width": 16},
         "score": {"num_actions": 8},

@@ -569,6 +569,6 @@ def test_settings_may_have_measures_of_their_own(steps, study, capfd):
     assert lines[0].endswith("| seeds | success | full | success, minus none |")
     assert lines[3] == "| 4 | counting | other | 1 | 0.40 |  | +0.00 |"
     assert lines[5] == "| 8 | counting | other | 1 |  | 0.40 | +0.00 |"
-    assert lines[11] == "| 8 | counting | none | 0.40 | 0.40 |"
+    assert lines[13] == "| 8 | counting | none | 0.40 | 0.40 |"
     out = capfd.readouterr().out
     assert out.splitlines()[-1] == "all: 8/20 (none), 8/20 (other)"
