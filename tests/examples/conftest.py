@@ -35,6 +35,7 @@ SMALL_ENV = {
         "transformer": {"steps": 20, "eval_every": 10, "layers": 1, "width": 16},
         "score": {"num_actions": 8},
         "truth": {"actions": 4, "oracle_actions": 3},
+        "augmentation": {"counterfactual_ratio": 0.5},
         "evaluate": {"episodes": 3, "validation_episodes": 2},
     },
     "ogbench_cube_double": {
