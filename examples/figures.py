@@ -417,6 +417,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         file.stem
         for file in sorted((CONF / "study").glob("*.yaml"))
         if (options.results / f"{file.stem}.csv").exists()
+        and load_study(file.stem).publish is not None  # else it is another table
     ]
     for name in names:
         study = load_study(name)
