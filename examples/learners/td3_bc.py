@@ -18,13 +18,18 @@ _NOT_CLONED = "not_cloned"
 class TD3BC(TD3):
     """TD3 that repeats the actions of successful episodes up to their first success.
 
-    It repeats those of counterfactuals too: a swap leaves out what the action is for.
+    Where no episode has a goal of its own it repeats all actions. It repeats those of
+    counterfactuals too: a swap leaves out what the action is for.
     """
 
     def rows(self) -> TensorDictBase:
         """Returns what learning reads, and which actions are not repeated."""
         rows = super().rows()
-        return rows.set(_NOT_CLONED, ~until_success(rows).unsqueeze(-1))
+        cloned = torch.ones(len(rows), dtype=torch.bool)
+        # Play reaches no goal of its own, and all of its rows lead to later states.
+        if self.environment.episodes_have_goals:
+            cloned = until_success(rows)
+        return rows.set(_NOT_CLONED, ~cloned.unsqueeze(-1))
 
     def loss_options(self) -> dict[str, Any]:
         """Returns the arguments of the cloning term."""

@@ -309,6 +309,15 @@ def test_actions_that_do_not_explain_the_goal_are_not_cloned(configure, steps):
     assert torch.equal(seen[0], stored | (flags & moved))
 
 
+def test_all_of_play_is_cloned(configure, steps, modules, monkeypatch):
+    options = ("learner.batch_size=64", "learner.successful=null")
+    cfg = configure("kitchen", "td3_bc", *options)
+    assert make(steps, cfg).rows()["not_cloned"].any()
+    kind = modules.environments["kitchen"]
+    monkeypatch.setattr(kind, "episodes_have_goals", False)
+    assert not make(steps, cfg).rows()["not_cloned"].any()
+
+
 def test_goals_of_other_rows_are_not_cloned_without_augmentation(configure, steps):
     """A share of the goals is random then (A.5.2): no action explains them either."""
     options = ("learner.batch_size=64", "env.augmentation.counterfactual_ratio=0.8")

@@ -33,7 +33,8 @@ def ogbench_cube_reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.
         >>> ogbench_cube_reward(achieved, torch.tensor([[0.3, 0.0, 0.2]]).expand(2, 3))
         tensor([ 0., -1.])
     """
-    if achieved.shape != desired.shape or not achieved.ndim or achieved.shape[-1] % 3:
+    width = achieved.shape[-1] if achieved.ndim else 0
+    if achieved.shape != desired.shape or not width or width % 3:
         raise ValueError(
             f"achieved has shape {list(achieved.shape)} and desired "
             f"{list(desired.shape)}, expected [*B, 3 n] of both: three positions of "
