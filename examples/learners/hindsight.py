@@ -46,20 +46,21 @@ def until_success(rows: TensorDictBase) -> torch.Tensor:
 
     Args:
         rows (TensorDictBase): transitions ``[T]`` whose reward is 0 where the desired
-            goal is reached and negative elsewhere, one trajectory after another.
+            goal is reached and negative elsewhere.
 
     Returns:
         torch.Tensor: bool ``[T]``.
     """
-    success = rows["next", "reward"].reshape(-1) >= 0
     index = trajectory_index(rows)
+    order = index.rows(torch.arange(len(rows)))  # trajectories may be interleaved
+    success = rows["next", "reward"].reshape(-1)[order] >= 0
     total = success.cumsum(0)
     # Successes before the trajectory, and in the whole of it, for each row.
     ends = total[index.ends]
     before = torch.cat([ends.new_zeros(1), ends[:-1]])
     solved = (ends > before).repeat_interleave(index.lengths)
     earlier = total - success.long() - before.repeat_interleave(index.lengths)
-    return solved & (earlier == 0)
+    return torch.empty_like(solved).index_copy_(0, order, solved & (earlier == 0))
 
 
 class ShareSampler(RandomSampler):

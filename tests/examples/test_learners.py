@@ -278,6 +278,11 @@ def test_rows_until_success(modules, episodes):
         for step in range(len(episode))
     ]
     assert modules.hindsight.until_success(rows).tolist() == expected
+    # Interleaved: the first rows of all episodes, then the second ones, ...
+    steps = torch.tensor([step for e in episodes for step in range(len(e))])
+    mixed = steps.argsort(stable=True)
+    found = modules.hindsight.until_success(rows[mixed])
+    assert found.tolist() == torch.tensor(expected)[mixed].tolist()
 
 
 def test_a_share_of_rows_is_of_successful_episodes(modules):
