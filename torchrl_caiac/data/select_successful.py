@@ -133,6 +133,11 @@ def _successes(
             "for each transition"
         )
     leaf = leaf.as_subclass(torch.Tensor).reshape(-1).cpu()
+    if leaf.is_floating_point() and bool(leaf.isnan().any()):
+        raise ValueError(
+            f"{key!r} is NaN in {int(leaf.isnan().sum())} of {len(leaf)} transitions: "
+            "remove or repair them"
+        )
     if above is not None:
         return leaf > above
     if leaf.dtype is not torch.bool and not bool(((leaf == 0) | (leaf == 1)).all()):
