@@ -106,6 +106,8 @@ class Setting:
         }
         if goals:
             calls["goals"] = self.with_goals().sample
+        if goals and self.window == 1:
+            calls["lookahead"] = self.buffer(self.caiac(lookahead="next")).sample
         return calls
 
     def caiac(self, **kwargs: Any) -> CAIACTransform:
@@ -242,7 +244,12 @@ def bench_transitions(
         ("4 x 512", replace(setting, windows=4 * 512).calls(), 150),
     ):
         times = seconds(some, rounds=rounds, warmup=20)
-        for name, target in (("swap", 1.6), ("goals", 2.2), ("donors", 1.6)):
+        for name, target in (
+            ("swap", 1.6),
+            ("lookahead", 2.0),
+            ("goals", 2.2),
+            ("donors", 1.6),
+        ):
             label = f"{what} transitions, {LABELS[name]} / plain, {rows} {kind}"
             judge(label, times[name] / times["plain"], at_most=target)
         label = f"{what} transitions, fingerprints compared / not, {rows} {kind}"
@@ -271,7 +278,32 @@ def bench_windows(
     benchmark.pedantic(calls["swap"], rounds=20)
 
 
-LABELS = {"swap": "swap", "goals": "goals and swap", "donors": "donor buffer"}
+LABELS = {
+    "swap": "swap",
+    "lookahead": "swap with lookahead",
+    "goals": "goals and swap",
+    "donors": "donor buffer",
+}
+
+
+@pytest.mark.parametrize("rows", ROWS)
+def bench_lookahead_table(
+    benchmark: Any, judge: Any, rows: str, kind: str, folder: Path, device: torch.device
+) -> None:
+    """What the first sample after a write adds: the table of lookahead."""
+    setting = made(TRANSITIONS, 512, rows, kind, folder, device)
+    transform = setting.caiac(lookahead="next")
+    rb = setting.buffer(transform)
+
+    def build() -> None:
+        transform.refresh_donors()
+        rb.sample()
+
+    took = seconds({"build": build, "plain": rb.sample}, rounds=5)
+    nanoseconds = (took["build"] - took["plain"]) / ROWS[rows] * 1e9
+    label = f"lookahead, building the table, ns a row, {rows} {kind}"
+    judge(label, nanoseconds, at_most=500)
+    benchmark.pedantic(build, rounds=5)
 
 
 # --- growth and memory ---------------------------------------------------------------
@@ -352,6 +384,8 @@ def bench_memory(
     )
     calls = setting.calls()
     for name, label in LABELS.items():
+        if name not in calls:
+            continue
         batch = calls[name]().bytes()
         judge(
             f"{shape}, {label}: peak memory / batch",

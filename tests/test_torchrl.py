@@ -6,6 +6,7 @@ import ast
 import importlib
 import inspect
 import pkgutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -246,6 +247,18 @@ def test_prefetched_batches_are_dropped(rb):
     fence.storage_data(rb.storage)["a"].fill_(9)
     fence.drop_prefetched(rb)
     assert (rb.sample()["a"] == 9).all()
+
+
+def test_writes_of_other_threads_wait():
+    rb = ReplayBuffer(storage=LazyTensorStorage(4))
+    with ThreadPoolExecutor() as pool:
+        with fence.writes_paused(rb), fence.writes_paused(rb.storage):
+            written = pool.submit(rb.extend, rows(2))
+            with pytest.raises(TimeoutError):
+                written.result(timeout=0.05)
+            assert len(rb) == 0
+        written.result(timeout=10)
+    assert len(rb) == 2
 
 
 def test_a_loaded_folder_becomes_memory_mapped(tmp_path):

@@ -8,6 +8,8 @@ and that no other module uses such a name.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -41,6 +43,7 @@ __all__ = [
     "storage_rows",
     "tensor_version",
     "vmap_loss",
+    "writes_paused",
 ]
 
 
@@ -255,6 +258,30 @@ def sampled_rows() -> tuple[ReplayBuffer, Any] | None:
                 return buffer, variables.get("index")
         frame = frame.f_back  # type: ignore[assignment]
     return None
+
+
+@contextmanager
+def writes_paused(source: ReplayBuffer | TensorStorage) -> Iterator[None]:
+    """Has other threads of this process wait before they write through a buffer.
+
+    Batches may be prefetched by threads, while the main one extends the buffer.
+
+    Args:
+        source (ReplayBuffer or TensorStorage): the buffer; a storage has no lock.
+
+    Examples:
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> from torchrl_caiac._torchrl import writes_paused
+        >>> rb = ReplayBuffer(storage=LazyTensorStorage(4))
+        >>> with writes_paused(rb):
+        ...     len(rb)
+        0
+    """
+    if isinstance(source, ReplayBuffer):
+        with source._replay_lock:
+            yield
+    else:
+        yield
 
 
 def drop_prefetched(rb: ReplayBuffer) -> None:

@@ -110,8 +110,8 @@ def swap_shares(
         SwapShares: the shares.
 
     Raises:
-        ValueError: the transform has longer windows or a donor buffer, or the shapes do
-            not fit.
+        ValueError: the transform has longer windows, lookahead or a donor buffer, or
+            the shapes do not fit.
 
     Examples:
         >>> import torch
@@ -126,6 +126,11 @@ def swap_shares(
         raise ValueError(
             f"the transform has windows of {transform.window} rows and donors "
             f"{transform.donors!r}: give one with window=1 and donors=None"
+        )
+    if transform.lookahead is not None:
+        raise ValueError(
+            f"the transform has lookahead={transform.lookahead!r}, which reads "
+            "trajectories: give one with lookahead=None"
         )
     expected = (len(influenced), *transform.feature_shape)
     if tuple(scores.shape) != expected or influenced.shape[1:] != expected[-1:]:

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 
 from environments.base import Environment
 from environments.playing import Recording, Split, play_together
+from shared.settings import keep_settings
 from torchrl_caiac.data import (
     load_minari,
     load_transitions,
@@ -100,6 +101,8 @@ class FetchPush(Environment):
             load_minari(dataset, out / name, infos=["simulator"], progress=progress)
         self._mix(out / "held_out", ("held_out_expert", "held_out_random"))
         number, folder = self.settings.demonstrations, self.folder
+        source = {"expert": data_digest(out / "expert"), "demonstrations": number}
+        keep_settings(folder, "demonstrations_source", source)
         expert = load_transitions(out / "expert")
         for name, cut in (("successful", False), ("demonstrations", True)):
             if not (folder / name).exists():
@@ -169,10 +172,17 @@ class FetchPush(Environment):
     ) -> list[dict[str, Any]]:
         """Plays episodes from the same starts for all runs."""
         settings = self.settings.evaluate
-        episodes, first = {
+        numbers = {
             "test": (settings.episodes, settings.seed),
             "validation": (settings.validation_episodes, settings.validation_seed),
-        }[split]
+        }
+        spans = [range(first, first + number) for number, first in numbers.values()]
+        if set(spans[0]) & set(spans[1]):
+            raise ValueError(
+                f"env.evaluate: the seeds of the validation starts, {spans[1]}, are "
+                f"also some of the test starts, {spans[0]}: change validation_seed"
+            )
+        episodes, first = numbers[split]
         torch.manual_seed(seed)  # for policies that draw
         steps = self.settings.collect.steps
         return play(actor, episodes=episodes, steps=steps, seed=first, **self.cubes)

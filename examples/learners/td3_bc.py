@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from learners.hindsight import until_success
+from learners.hindsight import UNEXPLAINED, until_success
 from learners.td3 import TD3
 
 __all__ = ["TD3BC"]
@@ -32,8 +32,5 @@ class TD3BC(TD3):
 
     def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
         """Takes a step; actions do not explain goals that other rows achieve."""
-        unexplained = batch["hindsight", "relabeled"]
-        flags = batch.get(("caiac", "counterfactual"), None)
-        if flags is not None:
-            batch[_NOT_CLONED] = batch[_NOT_CLONED] | (flags & unexplained)
+        batch[_NOT_CLONED] = batch[_NOT_CLONED] | batch[UNEXPLAINED]
         return super().step(batch, step)

@@ -1,4 +1,4 @@
-"""Successful trajectories against a slow search, episode by episode."""
+"""The selection of successful trajectories against a slow search."""
 
 from __future__ import annotations
 
@@ -6,125 +6,167 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
+from tensordict import LazyStackedTensorDict, NonTensorData, NonTensorStack, TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torchrl_caiac.data import (
-    action_bounds,
-    load_transitions,
-    select_successful,
-    verify_digests,
-    write_transitions,
-)
-
-REWARD = ("next", "reward")
+from torchrl_caiac.data import load_transitions, select_successful
 
 
 def make_rows(episode: list[int], success: list[bool]) -> TensorDict:
-    """Rows that know their places, with a reward of 0 at success and -1 elsewhere."""
+    """Rows that are numbered in ``"row"``, none of which ends its trajectory."""
     rows = len(episode)
-    none = torch.zeros(rows, 1, dtype=torch.bool)
+    flags = {
+        name: torch.zeros(rows, 1, dtype=torch.bool)
+        for name in ("done", "terminated", "truncated")
+    }
     return TensorDict(
         {
             "row": torch.arange(rows),
             "action": torch.zeros(rows, 2),
             "episode": torch.tensor(episode),
-            "next": {
-                "reward": torch.tensor(success).float().view(rows, 1) - 1,
-                "success": torch.tensor(success),
-                "done": none,
-                "truncated": none.clone(),
-                "terminated": none.clone(),
-            },
+            "next": {"success": torch.tensor(success, dtype=torch.bool), **flags},
         },
         [rows],
     )
 
 
-def slow_selection(
-    episode: list[int], success: list[bool], cut: bool, count: int | None
-) -> list[list[int]]:
-    """Goes through the rows of each episode, one by one."""
-    found = []
+#: Two interleaved episodes, the first of which succeeds in its second row.
+EPISODE, SUCCESS = [0, 1, 0, 1, 0, 1], [False, False, True, False, True, False]
+
+
+def flags(rows: TensorDict, *key: str) -> list[int]:
+    return rows[("next", *key)].reshape(-1).int().tolist()
+
+
+def slow_rows(
+    episode: list[int], success: list[bool], cut: bool, most: int | None
+) -> list[int]:
+    """Looks at each episode, in the order of their first rows."""
+    found: list[list[int]] = []
     for own in dict.fromkeys(episode):
-        rows = [row for row, other in enumerate(episode) if other == own]
-        first = next((n for n, row in enumerate(rows) if success[row]), None)
+        rows = [r for r in range(len(episode)) if episode[r] == own]
+        first = next((n for n, r in enumerate(rows) if success[r]), None)
         if first is not None:
             found.append(rows[: first + 1] if cut else rows)
-    return found[:count]
+    return [row for rows in found[:most] for row in rows]
 
 
-@st.composite
-def recordings(draw: st.DrawFn) -> tuple[list[int], list[bool]]:
-    rows = draw(st.integers(1, 30))
-    episode = draw(st.lists(st.integers(0, 4), min_size=rows, max_size=rows))
-    success = draw(st.lists(st.booleans(), min_size=rows, max_size=rows))
-    return episode, success
-
-
-@given(recordings(), st.booleans(), st.none() | st.integers(1, 3))
-@settings(max_examples=80, deadline=None)
-def test_rows_are_those_of_a_slow_search(recording, cut, count) -> None:
-    episode, success = recording
-    rows = make_rows(episode, success)
-    expected = slow_selection(episode, success, cut, count)
-    if len(expected) < (count or 1):
-        with pytest.raises(ValueError, match=r"trajectories succeed according to"):
-            select_successful(rows, cut=cut, trajectories=count)
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=30),
+    st.booleans(),
+    st.sampled_from([None, 1, 2]),
+)
+@settings(max_examples=60, deadline=None)
+def test_rows_are_those_of_a_slow_search(drawn, cut, most) -> None:
+    episode, success = [e for e, _ in drawn], [s for _, s in drawn]
+    data = make_rows(episode, success)
+    expected = slow_rows(episode, success, cut, most)
+    solved = {e for e, s in drawn if s}
+    if len(solved) < (most or 1):
+        with pytest.raises(ValueError, match=f"{len(solved)} of .* succeed"):
+            select_successful(data, cut=cut, trajectories=most)
         return
-    found = select_successful(rows, cut=cut, trajectories=count)
-    assert found["row"].tolist() == [row for part in expected for row in part]
-    ends = {part[-1] for part in expected} if cut else set()
-    for name in ("done", "truncated"):
-        assert set(found["row"][found["next", name][:, 0]].tolist()) == ends
-    assert not found["next", "terminated"].any()
-    by_reward = select_successful(rows, REWARD, above=-0.5, cut=cut, trajectories=count)
-    assert torch.equal(by_reward["row"], found["row"])
-    assert not rows["next", "done"].any()  # the data stay
+    found = select_successful(data, cut=cut, trajectories=most)
+    assert found["row"].tolist() == expected
+    ids = [episode[row] for row in expected]
+    ends = [int(a != b) for a, b in zip(ids, [*ids[1:], None], strict=True)]
+    assert flags(found, "done") == flags(found, "truncated")
+    assert flags(found, "done") == (ends if cut else [0] * len(ends))
+    assert not any(flags(data, "done"))  # the input is not changed
 
 
-@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.float32])
-def test_flags_keep_their_dtype(dtype) -> None:
-    rows = make_rows([0, 0, 0], [False, True, False])
-    for name in ("success", "done", "truncated"):
-        rows["next", name] = rows["next", name].to(dtype)
-    found = select_successful(rows)
-    assert found["next", "done"].dtype is dtype
-    assert found["next", "done"][:, 0].tolist() == [0, 1]
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int64, torch.float32])
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1)])
+def test_flags_keep_their_type_and_shape(dtype, shape) -> None:
+    data = make_rows(EPISODE, SUCCESS)
+    data["next"] = data["next"].apply(lambda leaf: leaf.to(dtype).reshape(shape))
+    found = select_successful(data)
+    assert found["row"].tolist() == [0, 2]
+    done = found["next", "done"]
+    assert done.dtype == dtype and done.shape == data["next", "done"][:2].shape
+    assert flags(found, "done") == [0, 1]
 
 
-def test_a_folder_has_digests_and_action_bounds(tmp_path) -> None:
-    rows = make_rows([0, 0, 1], [False, True, False])
-    stored = write_transitions(rows, tmp_path / "a", action_bounds=([-2, -1], [2, 1]))
-    found = select_successful(stored, path=tmp_path / "b")
-    assert found.is_memmap() and found["row"].tolist() == [0, 1]
-    verify_digests(tmp_path / "b")
-    low, high = action_bounds(load_transitions(tmp_path / "b"))
-    assert low.tolist() == [-2, -1] and high.tolist() == [2, 1]
-    with pytest.raises(FileExistsError, match=r"overwrite=True"):
-        select_successful(stored, path=tmp_path / "b")
-    select_successful(stored, cut=False, path=tmp_path / "b", overwrite=True)
+def test_what_ended_before_is_not_truncated() -> None:
+    data = make_rows([0, 0, 1, 1], [False, True, True, False])
+    for name in ("done", "terminated"):
+        data["next", name][1] = True
+    found = select_successful(data)
+    assert found["row"].tolist() == [0, 1, 2]
+    assert flags(found, "done") == [0, 1, 1]
+    assert flags(found, "terminated") == [0, 1, 0]
+    assert flags(found, "truncated") == [0, 0, 1]
 
 
-def test_wrong_data_are_refused() -> None:
-    rows = make_rows([0, 0], [False, True])
-    with pytest.raises(KeyError, match=r"lack .*nothing.*key="):
-        select_successful(rows, "nothing")
-    with pytest.raises(ValueError, match=r"from -1 to 0, expected a flag.*above="):
-        select_successful(rows, REWARD)
-    rows["next", "reward"] = torch.tensor([float("nan"), 0.0])
-    with pytest.raises(ValueError, match=r"is NaN in 1 of 2"):
-        select_successful(rows, REWARD, above=-0.5)
-    rows["next", "success"] = torch.zeros(2, 3)
-    with pytest.raises(ValueError, match=r"shape \[2, 3\], expected \[T\]"):
-        select_successful(rows)
-    with pytest.raises(ValueError, match="trajectories"):
-        select_successful(make_rows([0], [True]), trajectories=0)
-    with pytest.raises(KeyError, match="trajectory ids"):
-        select_successful(make_rows([0], [True]).exclude("episode"))
+def test_end_flags_may_be_nested_and_alone() -> None:
+    data = make_rows(EPISODE, SUCCESS)
+    flag = data["next", "done"]
+    data["next"] = {"agent": {"done": flag, "truncated": flag.clone()}}
+    data["next", "info", "success"] = torch.tensor(SUCCESS)
+    found = select_successful(
+        data, ("next", "info", "success"), done_key=("next", "agent", "done")
+    )
+    assert flags(found, "agent", "done") == flags(found, "agent", "truncated") == [0, 1]
+    alone = make_rows([0] * 6, SUCCESS).exclude("episode")
+    alone["next", "done"][[2, 5]] = True  # two trajectories of three rows
+    found = select_successful(alone, trajectory_key=None)
+    assert found["row"].tolist() == [0, 1, 2, 3, 4]
+    assert flags(found, "done") == [0, 0, 1, 0, 1]
 
 
-def test_end_flags_alone_mark_trajectories() -> None:
-    rows = make_rows([0, 0, 0, 0], [False, True, False, False]).exclude("episode")
-    rows["next", "done"][1] = True
-    found = select_successful(rows, trajectory_key=None)
-    assert found["row"].tolist() == [0, 1]
+def test_entries_of_all_kinds_are_kept() -> None:
+    data = make_rows(EPISODE, SUCCESS)
+    data["agents"] = TensorDict({"x": torch.rand(6, 3, 1)}, [6, 3])
+    data["task"] = NonTensorStack(*[NonTensorData(f"task {n}") for n in range(6)])
+    found = select_successful(data)
+    assert found["agents"].batch_size == (2, 3)
+    assert torch.equal(found["agents", "x"], data["agents", "x"][[0, 2]])
+    assert list(found["task"]) == ["task 0", "task 2"]
+    stack = LazyStackedTensorDict(*make_rows(EPISODE, SUCCESS).unbind(0))
+    assert select_successful(stack)["row"].tolist() == [0, 2]
+
+
+def test_memory_mapped_data_are_read_and_written(tmp_path) -> None:
+    data = make_rows(EPISODE, SUCCESS).memmap_(tmp_path / "all")
+    inside = select_successful(data)
+    inside["row"][0] = 9  # a copy in memory
+    assert data["row"].tolist() == list(range(6)) and not flags(data, "done")[2]
+    select_successful(data, path=tmp_path / "part")
+    found = load_transitions(tmp_path / "part")
+    assert found["row"].tolist() == [0, 2] and flags(found, "truncated") == [0, 1]
+    with pytest.raises(FileExistsError):
+        select_successful(data, path=tmp_path / "part")
+
+
+def test_numbers_are_compared() -> None:
+    data = make_rows(EPISODE, SUCCESS)
+    data["next", "reward"] = torch.tensor(SUCCESS).float() - 1.0
+    found = select_successful(data, ("next", "reward"), above=-0.5)
+    assert found["row"].tolist() == [0, 2]
+    assert select_successful(data, above=0.5)["row"].tolist() == [0, 2]
+    with pytest.raises(ValueError, match=r"values from -1 to 0.*pass above="):
+        select_successful(data, ("next", "reward"))
+    data["next", "reward"][3] = torch.nan
+    with pytest.raises(ValueError, match=r"'reward'\) in row 3 is nan.*unknown"):
+        select_successful(data, ("next", "reward"), above=-0.5)
+    with pytest.raises(ValueError, match="above is nan"):
+        select_successful(data, above=float("nan"))
+    with pytest.raises(TypeError, match="above must be a number, got '0'"):
+        select_successful(data, above="0")
+
+
+def test_other_data_are_refused() -> None:
+    data = make_rows(EPISODE, SUCCESS)
+    with pytest.raises(ValueError, match=r"batch size \[0\], no transitions"):
+        select_successful(data[:0])
+    assert select_successful(data[2:3])["row"].tolist() == [2]
+    rb = ReplayBuffer(storage=LazyTensorStorage(6))
+    rb.extend(data)
+    with pytest.raises(TypeError, match=r"ReplayBuffer.*from_replay_buffer"):
+        select_successful(rb)
+    with pytest.raises(ValueError, match=r"trajectories must be .* at least 1, got 0"):
+        select_successful(data, trajectories=0)
+    with pytest.raises(KeyError, match="name the one they have with key="):
+        select_successful(data, "solved")
+    with pytest.raises(ValueError, match=r"\[6, 2\], expected \[T\] or \[T, 1\]"):
+        select_successful(data, "action")

@@ -49,6 +49,23 @@ def test_rows_are_three_to_seven(cfg, environment, steps):
     assert (rows["source"] == 0).sum() == 100
 
 
+def test_demonstrations_of_other_data_are_refused(cfg, environment, monkeypatch):
+    digest = f"{type(environment).__module__}.data_digest"
+    monkeypatch.setattr(digest, lambda folder: "another")
+    with pytest.raises(ValueError, match="expert"):
+        environment.collect()
+
+
+@pytest.mark.parametrize("seeds", [(5, 5), (5, 6), (6, 5)])
+def test_splits_have_no_start_in_common(seeds, cfg, steps):
+    cfg = cfg.copy()
+    cfg.env.evaluate.seed, cfg.env.evaluate.validation_seed = seeds
+    cfg.env.evaluate.episodes = cfg.env.evaluate.validation_episodes = 2
+    environment = steps.parts.make_environment(cfg)
+    with pytest.raises(ValueError, match="change validation_seed"):
+        environment.play(None, 0, None, split="test")
+
+
 def test_held_out_episodes_are_other_ones(environment):
     rows, held_out = environment.rows(), environment.held_out()
     assert len(held_out) == 200

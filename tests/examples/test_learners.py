@@ -309,6 +309,19 @@ def test_actions_that_do_not_explain_the_goal_are_not_cloned(configure, steps):
     assert torch.equal(seen[0], stored | (flags & moved))
 
 
+def test_goals_of_other_rows_are_not_cloned_without_augmentation(configure, steps):
+    """A share of the goals is random then (A.5.2): no action explains them either."""
+    options = ("learner.batch_size=64", "env.augmentation.counterfactual_ratio=0.8")
+    made = make(steps, configure("fetch_push", "td3_bc", *options, method="none"))
+    batch = next(made.batches())
+    stored, moved = batch["not_cloned"].clone(), batch["hindsight", "relabeled"]
+    made.step(batch, 1)
+    new = batch["not_cloned"] & ~stored
+    assert new.any() and not (new & ~moved).any()
+    # Of the rows, 0.4 have random goals and 0.5 those of their future.
+    assert 0.25 < new[~stored].float().mean().item() < 0.55
+
+
 @pytest.mark.parametrize("learner", ["td3", "td3_bc", "iql"])
 def test_targets_have_no_gradient(learner, configure, steps):
     """The loss of the action values has no gradient but for the values themselves."""

@@ -13,16 +13,22 @@ from tensordict import TensorDict
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
+    PrioritizedSampler,
     ReplayBuffer,
+    ReplayBufferEnsemble,
+    SamplerWithoutReplacement,
     SliceSampler,
+    SliceSamplerWithoutReplacement,
     TensorDictReplayBuffer,
 )
 
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
+from torchrl_caiac.evaluation import swap_shares
 from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms.lookahead import (
     NEVER,
+    hold_entities,
     locked_entities,
     steps_to_influence,
 )
@@ -306,3 +312,157 @@ def test_the_rule_needs_no_number() -> None:
         rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
         swapped = rb.sample()["caiac", "swapped"]
         assert not swapped[:, 1].any() and swapped[:, 2].all()
+
+
+def locks(influenced: torch.Tensor, episode: torch.Tensor) -> torch.Tensor:
+    """What each row locks by the rule, found slowly."""
+    steps = slow_steps(influenced.tolist(), episode.tolist())
+    return torch.tensor([slow_locked(row, "next", {0}) for row in steps])
+
+
+def assert_kept(batch: TensorDict, locked: torch.Tensor) -> None:
+    """Neither row nor donor locks what a batch of some rows swapped."""
+    place = (batch["observation"] / 3).floor().long()
+    own = place[:, 0]
+    changed = place != own.unsqueeze(-1)
+    assert changed.any()
+    assert not (changed & (locked[own] | locked.gather(0, place))).any()
+
+
+@pytest.mark.parametrize(
+    "make_sampler",
+    [
+        SamplerWithoutReplacement,
+        lambda: PrioritizedSampler(120, 0.7, 0.5),
+        lambda: SliceSampler(slice_len=4, traj_key="episode", strict_length=False),
+        lambda: SliceSampler(
+            slice_len=4, traj_key="episode", strict_length=False, pad_output=True
+        ),
+        lambda: SliceSamplerWithoutReplacement(slice_len=4, traj_key="episode"),
+    ],
+)
+def test_samplers_of_all_kinds(make_sampler) -> None:
+    influenced, episode = make_influenced()
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(120), sampler=make_sampler(), batch_size=60
+    )
+    rb.extend(make_rows(influenced, episode))
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    for _ in range(4):
+        assert_kept(rb.sample(), locks(influenced, episode))
+
+
+def test_a_ring_that_is_written_between_samples() -> None:
+    influenced, episode = make_influenced()
+    rows = make_rows(influenced, episode)
+    rb = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=60)
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    for end in range(15, 121, 15):
+        rb.extend(rows[end - 15 : end])
+        first = max(0, end - 50)
+        locked = torch.ones(120, 3, dtype=torch.bool)
+        locked[first:end] = locks(influenced[first:end], episode[first:end])
+        assert_kept(rb.sample(), locked)
+
+
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
+@pytest.mark.parametrize("capacity", [60, 120, 180])
+def test_storages_of_several_environments(storage, capacity) -> None:
+    influenced, episode = make_influenced()
+    rows = make_rows(influenced, episode).reshape(6, 20).transpose(0, 1).contiguous()
+    rb = TensorDictReplayBuffer(
+        storage=storage(capacity, ndim=2), batch_size=60, dim_extend=0
+    )
+    rb.extend(rows)
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    # What a row locks depends on later rows alone, which a full ring keeps.
+    assert_kept(rb.sample(), locks(influenced, episode))
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int64, torch.float16])
+@pytest.mark.parametrize("threshold", [0.5, {"cup": 0.5, "lid": 0.5}])
+@pytest.mark.parametrize("buffer", [False, True])
+def test_scores_of_all_types(dtype, threshold, buffer) -> None:
+    influenced, episode = make_influenced()
+    rows = make_rows(influenced, episode)
+    rows["caiac", "score"] = rows["caiac", "score"].to(dtype)
+    rb = TensorDictReplayBuffer(storage=LazyTensorStorage(120), batch_size=60)
+    rb.extend(rows)
+    donors = rb.storage if buffer else None
+    rb.append_transform(
+        CAIACTransform(LAYOUT, threshold, 1.0, lookahead="next", donors=donors)
+    )
+    assert_kept(rb.sample(), locks(influenced, episode))
+
+
+@pytest.mark.parametrize("scores", [torch.zeros(2, 3), torch.zeros(2, 4, 3)])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64, torch.int64])
+def test_locked_entities_are_held_at_any_threshold(scores, dtype) -> None:
+    locked = torch.tensor([[False, True, False], [False, False, True]])
+    held = hold_entities(scores.to(dtype), locked)
+    kind = CAIACTransform if scores.ndim == 2 else CoDATransform
+    for threshold in (0.0, 1e30, 1e300):
+        assert torch.equal(
+            kind(LAYOUT, threshold).swappable(held) != 0, ~locked & ~LAYOUT.fixed_mask
+        )
+
+
+def test_reordered_rows_with_equal_scores_are_refused() -> None:
+    rows = make_rows(torch.zeros(20, 3), torch.arange(20) // 10).exclude("caiac")
+    rows["observation"][:, 1] = rows["next", "observation"][:, 1] = 0.0
+    rb = ReplayBuffer(storage=LazyTensorStorage(20), batch_size=50)
+    rb.extend(rows)
+    score_by(rb, 0)
+    rb.append_transform(lambda td: td.flip(0))
+    rb.append_transform(CAIACTransform(LAYOUT, lookahead="next", unscored="keep"))
+    with pytest.raises(RuntimeError, match="the rows that the buffer drew"):
+        rb.sample()
+
+
+def test_what_has_no_trajectories_is_refused() -> None:
+    influenced, episode = make_influenced()
+    rows = make_rows(influenced, episode)
+    transform = CAIACTransform(LAYOUT, lookahead="next")
+    with pytest.raises(RuntimeError, match="only the scores of a batch are given"):
+        transform.generate_parameters(rows["caiac", "score"])
+    with pytest.raises(ValueError, match="lookahead='next', which reads trajectories"):
+        swap_shares(transform, rows["caiac", "score"], influenced)
+    rb = ReplayBuffer(storage=LazyTensorStorage(120), batch_size=32)
+    rb.extend(rows.exclude("caiac"))
+    rb.append_transform(lambda td: td.set(("caiac", "score"), torch.zeros(32, 3)))
+    rb.append_transform(transform)
+    with pytest.raises(KeyError, match="of all rows of the storage, which lacks them"):
+        rb.sample()
+    parts = [ReplayBuffer(storage=LazyTensorStorage(120)) for _ in range(2)]
+    for part in parts:
+        part.extend(rows)
+    ensemble = ReplayBufferEnsemble(*parts, batch_size=8)
+    ensemble.append_transform(CAIACTransform(LAYOUT, lookahead="next"))
+    with pytest.raises(RuntimeError, match=r"one buffer, but a ReplayBufferEnsemble"):
+        ensemble.sample()
+
+
+def test_refreshed_donors_are_looked_at_again() -> None:
+    influenced, episode = torch.zeros(20, 3, dtype=torch.bool), torch.zeros(20).long()
+    rb = ReplayBuffer(storage=LazyTensorStorage(20), batch_size=60)
+    rb.extend(make_rows(influenced, episode))
+    transform = CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next", donors=rb.storage)
+    rb.append_transform(transform)
+    assert rb.sample()["caiac", "swapped"][:, 1:].all()
+    rb.storage[:]["caiac", "score"][19, 1] = 1.0  # not through the buffer
+    transform.refresh_donors()
+    assert not rb.sample()["caiac", "swapped"][:, 1].any()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("where", ["cpu", "cuda"])
+def test_rows_on_a_gpu(where) -> None:
+    influenced, episode = make_influenced()
+    rb = ReplayBuffer(storage=LazyTensorStorage(120, device=where), batch_size=60)
+    rb.extend(make_rows(influenced, episode).to(where))
+    if where == "cpu":
+        rb.append_transform(lambda td: td.to("cuda"))
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    batch = rb.sample()
+    assert batch["caiac", "swapped"].is_cuda
+    assert_kept(batch.cpu(), locks(influenced, episode))

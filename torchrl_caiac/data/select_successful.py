@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
 from pathlib import Path
 
 import torch
@@ -13,7 +15,7 @@ from torchrl_caiac._keys import get_leaf
 from torchrl_caiac._keys import path as key_path
 from torchrl_caiac.data.action_bounds import action_bounds
 from torchrl_caiac.data.write_transitions import check_free, write_transitions
-from torchrl_caiac.trajectories import trajectory_index
+from torchrl_caiac.trajectories import end_flags, trajectory_index
 
 __all__ = ["select_successful"]
 
@@ -35,12 +37,14 @@ def select_successful(
     Imitation learners copy every row that they get. Episodes that fail, and what a
     demonstrator does after it has succeeded, teach them what nobody wants.
 
-    With ``cut``, the last row that is kept ends its trajectory: ``done_key`` and the
-    entry ``"truncated"`` beside it, if present, become true there.
+    With ``cut``, the last row that is kept ends its trajectory: unless it did before,
+    ``done_key`` and the entry ``"truncated"`` beside it, if present, become true there.
 
     Args:
-        data (TensorDictBase): transitions ``[T]``. For the trajectories see
-            :func:`~torchrl_caiac.trajectories.trajectory_index`.
+        data (TensorDictBase): transitions ``[T]``, in memory or memory-mapped, in the
+            order of time. For the trajectories see
+            :func:`~torchrl_caiac.trajectories.trajectory_index`, for the data of a
+            buffer :func:`~torchrl_caiac.data.from_replay_buffer`.
         key (NestedKey): what says that a transition succeeds, ``[T]`` or ``[T, 1]``: a
             flag, or with ``above`` a number such as the reward. Defaults to
             ``("next", "success")``.
@@ -70,8 +74,9 @@ def select_successful(
     Raises:
         FileExistsError: ``path`` exists and ``overwrite`` is ``False``.
         KeyError: the data lack ``key``, or ids and end flags.
-        ValueError: no trajectory succeeds, or fewer than ``trajectories``; or the entry
-            is not a flag and ``above`` is missing.
+        TypeError: ``data`` is not a tensordict, or ``above`` is not a number.
+        ValueError: no trajectory succeeds, or fewer than ``trajectories``; the entry is
+            not a flag and ``above`` is missing; or a value or ``above`` is NaN.
 
     Examples:
         >>> import torch
@@ -86,6 +91,17 @@ def select_successful(
         tensor([1, 1])
     """
     check_free(path, overwrite)
+    if not isinstance(data, TensorDictBase):
+        raise TypeError(
+            f"data is a {type(data).__name__}, expected a TensorDict [T]: write the "
+            "data of a buffer with from_replay_buffer, which sorts them by time"
+        )
+    if not data.batch_size.numel():
+        raise ValueError(
+            f"data has the batch size {list(data.batch_size)}, no transitions"
+        )
+    if trajectories is not None:
+        check_int("trajectories", trajectories, 1)
     index = trajectory_index(data, trajectory_key=trajectory_key, done_key=done_key)
     rows = index.rows(torch.arange(len(data), device=index.device)).cpu()
     successes = _successes(data, key, above)[rows]
@@ -96,8 +112,6 @@ def select_successful(
     before = torch.cat([count.new_zeros(1), count])[(index.ends.cpu() + 1) - lengths]
     is_successful = count[index.ends.cpu()] > before
     found = int(is_successful.sum())
-    if trajectories is not None:
-        check_int("trajectories", trajectories, 1)
     if found < (trajectories or 1):
         raise ValueError(
             f"{found} of {len(lengths)} trajectories succeed according to {key!r}"
@@ -110,8 +124,7 @@ def select_successful(
     if cut:
         earlier = count - successes.long() - before[number]
         kept &= earlier == 0
-    chosen = data[rows[kept].to(data.device or "cpu")]
-    chosen = TensorDict(chosen.to_dict(), chosen.batch_size, device=chosen.device)
+    chosen = data[rows[kept].to(data.device or "cpu")].to_tensordict()
     if cut:
         _end(chosen, number[kept], done_key)
     if path is None:
@@ -139,6 +152,15 @@ def _successes(
             "remove or repair them"
         )
     if above is not None:
+        if isinstance(above, bool) or not isinstance(above, Real):
+            raise TypeError(f"above must be a number, got {above!r}")
+        unknown = leaf.isnan() | math.isnan(above)
+        if bool(unknown.any()):
+            raise ValueError(
+                f"{key!r} in row {int(unknown.nonzero()[0])} is "
+                f"{leaf[unknown][0].item()}, above is {above}, so that its success is "
+                "unknown: correct the data or above"
+            )
         return leaf > above
     if leaf.dtype is not torch.bool and not bool(((leaf == 0) | (leaf == 1)).all()):
         raise ValueError(
@@ -153,6 +175,9 @@ def _end(rows: TensorDict, number: torch.Tensor, done_key: NestedKey | None) -> 
     """Sets the end flags of the last row of each trajectory."""
     last = torch.ones(len(number), dtype=torch.bool)
     last[:-1] = number[1:] != number[:-1]
+    done = None if done_key is None else end_flags(rows, done_key)
+    if done is not None:  # what ended its trajectory before is not truncated
+        last &= ~done.cpu()
     for key in () if done_key is None else (done_key, _beside(done_key, "truncated")):
         flags = rows.get(key, None)
         if flags is not None:

@@ -278,8 +278,8 @@ class CounterfactualTransform(RandomTransform, ABC):
     def refresh_donors(self) -> None:
         """Drops the index of eligible donors, so that it is built again.
 
-        It is rebuilt after every write through the buffer or its storage; call this
-        after writing to the storage's raw tensors.
+        So is the table of ``lookahead``. Both are rebuilt after every write through the
+        buffer or its storage; call this after writing to the storage's raw tensors.
         """
         for donors in self._donors:
             donors.refresh()
@@ -340,7 +340,22 @@ class CounterfactualTransform(RandomTransform, ABC):
 
         Returns:
             SwapDraw: the draw, for the last ``C`` windows.
+
+        Raises:
+            RuntimeError: with ``lookahead``, which reads more than these scores.
         """
+        if self._lookahead is not None:
+            raise RuntimeError(
+                f"lookahead={self.lookahead!r} reads the trajectories of the buffer "
+                "that samples, but only the scores of a batch are given: call "
+                "rb.sample(), or leave out lookahead"
+            )
+        return self._draw(scores, generator)
+
+    def _draw(
+        self, scores: torch.Tensor, generator: torch.Generator | None = None
+    ) -> SwapDraw:
+        """Draws by scores in which locked entities are held."""
         generator = self.generator if generator is None else generator
         free = self.swappable(scores)
         total = free.shape[0]
@@ -456,7 +471,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         if not self._free_share.is_done:
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)
-        draw = self.generate_parameters(scores)
+        draw = self._draw(scores)
         if self.check and self._donors:
             draw = self._donors[0].verified(draw)
         out = self._swap(tensordict, plan, values, draw)
@@ -480,7 +495,7 @@ class CounterfactualTransform(RandomTransform, ABC):
                 "that samples, but this batch is not sampled from a buffer: get it by "
                 "rb.sample() of the buffer that the transform is appended to"
             )
-        return lookahead.locked(*found, td.get(self.score_key))
+        return lookahead.locked(*found, td)
 
     def _check_buffer(self, td: TensorDictBase) -> None:
         """Raises if the buffer will relabel counterfactual rows of the batch."""

@@ -416,6 +416,8 @@ class BufferDonors:
     def refresh(self) -> None:
         """Drops the index: needed only after writing to the storage's raw tensors."""
         self._built = self._read = None
+        if self.lookahead is not None:
+            self.lookahead.refresh()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_built": None, "_read": None}

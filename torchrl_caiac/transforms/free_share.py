@@ -99,7 +99,8 @@ class FreeShare:
             found.append(
                 f"{never} in none of the first {self._windows} windows: nothing of "
                 "them is ever swapped, so the threshold is too low, their scores are "
-                "too high, or rows are not scored"
+                "too high, rows are not scored, or lookahead keeps what always comes "
+                "next"
             )
         if always:
             found.append(

@@ -10,9 +10,10 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data import ReplayBuffer, StorageEnsemble, TensorStorage
 
-from torchrl_caiac._torchrl import storage_revision, storage_rows
+from torchrl_caiac._fingerprints import fingerprint_key
+from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.influence.score_record import read_record
@@ -36,7 +37,7 @@ LookaheadArgument = int | Literal["next"] | None
 #: The number of steps of an entity that is not influenced any more in its trajectory.
 NEVER = 2**31 - 1
 
-# Rows whose scores are compared with the threshold together.
+# Scores that are compared with the threshold together.
 _CHUNK = 1 << 20
 _BUILDING = threading.Lock()  # batches may be prefetched by several threads
 
@@ -150,20 +151,21 @@ def hold_entities(scores: torch.Tensor, locked: torch.Tensor) -> torch.Tensor:
         locked (torch.Tensor): bool ``[n, N]``.
 
     Returns:
-        torch.Tensor: the scores, or graphs in which the action is linked to the locked
-        entities.
+        torch.Tensor: floating point, NaN for locked entities, or in graphs for the
+        action's link to them. NaN counts as influence with any threshold.
 
     Examples:
         >>> import torch
         >>> from torchrl_caiac.transforms.lookahead import hold_entities
-        >>> hold_entities(torch.zeros(1, 2), torch.tensor([[True, False]])) > 1
-        tensor([[ True, False]])
+        >>> hold_entities(torch.zeros(1, 2), torch.tensor([[True, False]]))
+        tensor([[nan, 0.]])
     """
-    influenced = torch.finfo(scores.dtype).max
+    if not scores.is_floating_point():
+        scores = scores.float()
     if scores.ndim == 2:
-        return scores.masked_fill(locked, influenced)
+        return scores.masked_fill(locked, torch.nan)
     held = scores.clone()
-    held[:, -1].masked_fill_(locked, influenced)
+    held[:, -1].masked_fill_(locked, torch.nan)
     return held
 
 
@@ -181,8 +183,8 @@ class Lookahead:
     Keyword Args:
         score_key (NestedKey): the scores.
         keys (TransformKeys): trajectory ids and end flags.
-        free (callable): maps the scores of rows, ``[n, ...]``, to bool ``[n, N]``, the
-            entities that may be swapped in these rows.
+        free (callable): maps the scores of single rows, ``[n, ...]``, to bool
+            ``[n, N]``, the entities that may be swapped in these rows.
         competing (callable): returns the entities that can be the next one, ``[N]``.
     """
 
@@ -220,13 +222,13 @@ class Lookahead:
             torch.Tensor: bool ``[T, N]``.
 
         Raises:
-            KeyError: trajectory ids and end flags are missing.
+            KeyError: the scores, or trajectory ids and end flags, are missing.
             TypeError: the storage does not contain a tensordict.
             ValueError: the scores look further ahead than the rule.
         """
         storage = source.storage if isinstance(source, ReplayBuffer) else source
         data = storage_rows(storage, "the storage of the buffer that samples")
-        with _BUILDING:
+        with _BUILDING, writes_paused(source):
             revision = storage_revision(storage)
             built = self._tables.get(storage)
             if built is None or built[0] != revision:
@@ -240,6 +242,12 @@ class Lookahead:
         storage: TensorStorage,
         data: TensorDictBase,
     ) -> torch.Tensor:
+        if data.get(self.score_key, None) is None:
+            raise KeyError(
+                f"lookahead={self.rule!r} reads {self.score_key!r} of all rows of the "
+                "storage, which lacks them: store them with score_buffer, or leave out "
+                "lookahead"
+            )
         scores = valid_scores(data, self.score_key, self.layout, len(storage))
         record = read_record(storage, data, self.score_key)
         own = 0 if record is None else int(record["settings"]["lookahead"])
@@ -252,41 +260,55 @@ class Lookahead:
         trajectories = trajectory_index(
             source, trajectory_key=self.keys.trajectory, done_key=self.keys.done
         )
-        influenced = torch.cat([~self._free(part) for part in scores.split(_CHUNK)])
+        step = max(1, _CHUNK // scores[0].numel())
+        influenced = torch.cat([~self._free(part) for part in scores.split(step)])
         steps = steps_to_influence(influenced, trajectories)
         steps += own * ((steps > 0) & (steps < NEVER))
         return locked_entities(steps, self.rule, self._competing().to(steps.device))
 
     def locked(
-        self, source: ReplayBuffer, index: Any, scores: torch.Tensor
+        self, source: ReplayBuffer, index: Any, batch: TensorDictBase
     ) -> torch.Tensor:
         """Returns what the rows of a batch lock.
 
         Args:
             source (ReplayBuffer): the buffer that samples.
             index (torch.Tensor or tuple): the rows that it drew.
-            scores (torch.Tensor): the scores of the batch, ``[B, ...]``.
+            batch (TensorDictBase): the batch, ``[B]``. Its scores, and fingerprints if
+                there are any, are compared with those of the rows, but not on an
+                accelerator, since that would wait for it.
 
         Returns:
             torch.Tensor: bool ``[B, N]``.
 
         Raises:
-            RuntimeError: the batch does not consist of these rows.
+            RuntimeError: the batch does not consist of these rows, or those of several
+                buffers.
         """
-        table, storage = self.table(source), source.storage
-        rows = flat_rows(index, storage)
-        same = len(rows) == len(scores)
-        if same and not LateCheck.needed(scores.device):
-            stored = plain_tensor(storage_rows(storage).get(self.score_key))
-            stored = pick_rows(stored, rows).to(scores.device)
-            same = torch.equal(stored.nan_to_num(), scores.nan_to_num())
+        storage = source.storage
+        if isinstance(storage, StorageEnsemble):
+            raise RuntimeError(
+                f"lookahead={self.rule!r} reads the trajectories of one buffer, but a "
+                f"{type(source).__name__} samples: join the data in one buffer, sample "
+                "the buffers one by one, or leave out lookahead"
+            )
+        table, rows = self.table(source), flat_rows(index, storage)
+        device = batch.get(self.score_key).device
+        same = len(rows) == len(batch)
+        if same and not LateCheck.needed(device):
+            data = storage_rows(storage)
+            same = all(
+                _is_same(batch.get(key, None), data.get(key, None), rows)
+                for key in (self.score_key, fingerprint_key(self.score_key))
+            )
         if not same:
             raise RuntimeError(
                 "the batch does not have the rows that the buffer drew, so that the "
                 "trajectories of its rows are unknown: append this transform before "
-                "others that select, repeat or reorder rows, or leave out lookahead"
+                "others that select, repeat or reorder rows, leave out prefetch if "
+                "rows are replaced while batches are prefetched, or leave out lookahead"
             )
-        return pick_rows(table, rows).to(scores.device)
+        return pick_rows(table, rows).to(device)
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: self.__dict__[key] for key in self.__dict__ if key != "_tables"}
@@ -294,3 +316,13 @@ class Lookahead:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.refresh()
+
+
+def _is_same(
+    leaf: torch.Tensor | None, stored: torch.Tensor | None, rows: torch.Tensor
+) -> bool:
+    """Returns whether a leaf of a batch has the stored values of rows."""
+    if leaf is None or stored is None:  # nothing to compare
+        return True
+    found = pick_rows(plain_tensor(stored), rows).to(leaf)
+    return torch.equal(found.nan_to_num(), leaf.nan_to_num())

@@ -203,8 +203,10 @@ class EntityThresholds:
             )
         # With the dtype of the scores, so that a number means the same for one entity
         # as for all of them: a float32 score is compared with the float32 number.
-        if (limit.device, limit.dtype) != (scores.device, scores.dtype):
-            self._limit = limit = self._tensor().to(scores.device, scores.dtype)
+        # Flags and integers cannot hold the numbers.
+        dtype = scores.dtype if scores.is_floating_point() else torch.float32
+        if (limit.device, limit.dtype) != (scores.device, dtype):
+            self._limit = limit = self._tensor().to(scores.device, dtype)
         return limit
 
     def _set(self, numbers: dict[str, float]) -> None:

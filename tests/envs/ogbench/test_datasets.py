@@ -163,6 +163,7 @@ def test_a_share_of_noisy_actions_is_random(tmp_path):
         ({"noisy": True, "action_noise": float("nan")}, "action_noise"),
         ({"noisy": True, "random_actions": float("nan")}, "random_actions"),
         ({"noisy": True, "random_actions": 1.5}, "random_actions"),
+        ({"random_actions": 0.1}, "noisy is False"),
     ],
 )
 def test_bad_input(wrong, match, tmp_path):

@@ -141,6 +141,11 @@ def create_ogbench_play(
             raise ValueError(f"{argument} is {value}, expected at least 1")
     if not (np.isfinite(action_noise) and action_noise >= 0):
         raise ValueError(f"action_noise is {action_noise}, expected at least 0")
+    if random_actions is not None and not noisy:
+        raise ValueError(
+            f"random_actions is {random_actions}, but noisy is False: OGBench's play "
+            "has none. Pass noisy=True, or leave it out"
+        )
     if random_actions is None:
         random_actions = _RANDOM_IN_PUZZLES if name.startswith("puzzle") else _RANDOM
     if not 0 <= random_actions <= 1:
