@@ -21,7 +21,13 @@ from hydra.utils import get_class
 
 from shared.results import Row, read_rows, run_key, state_of
 from shared.studies import CONF, Run, Study, load_study
-from torchrl_caiac._figures import colour, finish_results, name_label, new_figure
+from torchrl_caiac._figures import (
+    NUM_COLOURS,
+    colour,
+    finish_results,
+    name_label,
+    new_figure,
+)
 from torchrl_caiac._files import whole_file
 
 __all__ = ["answer_study", "draw_study", "main", "report_study"]
@@ -130,8 +136,13 @@ class Results:
 
     @cached_property
     def measures(self) -> list[str]:
-        """The names of measures; the first one is that of success."""
+        """The names of the measures of all settings."""
         return list(dict.fromkeys(row["measure"] for row in self.rows))
+
+    @cached_property
+    def success(self) -> dict[str, str]:
+        """The first measure of each setting, which is that of success."""
+        return {row["setting"]: row["measure"] for row in reversed(self.rows)}
 
     def tasks(self, setting: str, measure: str) -> list[str]:
         """Returns the tasks of a setting."""
@@ -187,9 +198,7 @@ def report_study(study: Study, runs: Sequence[Run], folder: Path) -> list[str]:
     """Writes the tables of a study to ``<folder>/<name>.md``, and returns the lines."""
     results = Results.read(study, runs, folder)
     lines = _table(results)
-    tasks = {
-        s: results.tasks(s, m) for s in study.settings for m in results.measures[:1]
-    }
+    tasks = {s: results.tasks(s, measure) for s, measure in results.success.items()}
     if any(len(names) > 1 for names in tasks.values()):
         lines += ["", *_task_table(results, tasks)]
     done = {run_key(row) for row in results.rows}
@@ -209,30 +218,29 @@ def _table(results: Results) -> list[str]:
     """Returns every measure of every group, and the difference of the first one."""
     if not results.rows:
         return ["There are no results yet."]
-    first = results.measures[0]
     heads = ["setting", "learner", "method", "seeds", *results.measures]
-    heads += [f"{first}, minus {BASELINE}"]
-    lines = _heads(heads, text=3)
+    lines = _heads([*heads, f"success, minus {BASELINE}"], text=3)
     for group in results.groups:
+        success = results.success[group[0]]
         means = [results.mean(group, measure) for measure in results.measures]
-        cells = [*group, str(len(results.values(group, first)))]
+        cells = [*group, str(len(results.values(group, success)))]
         cells += ["" if mean is None else mean.text() for mean in means]
-        difference = results.difference(group, first)
+        difference = results.difference(group, success)
         cells += ["" if difference is None else difference.text("+.2f")]
         lines.append(_line(cells))
     return lines
 
 
 def _task_table(results: Results, tasks: Mapping[str, Sequence[str]]) -> list[str]:
-    """Returns the first measure by task."""
-    measure = results.measures[0]
+    """Returns the first measure of each setting by task."""
     names = list(dict.fromkeys(name for part in tasks.values() for name in part))
-    lines = [f"{measure} by task:", ""]
+    lines = ["success by task:", ""]
     lines += _heads(["setting", "learner", "method", *names], text=3)
     for group in results.groups:
         cells = list(group)
         for name in names:
             known = name in tasks[group[0]]
+            measure = results.success[group[0]]
             mean = results.mean(group, measure, [name]) if known else None
             cells.append("" if mean is None else mean.text())
         lines.append(_line(cells))
@@ -252,11 +260,13 @@ def answer_study(study: Study, runs: Sequence[Run], folder: Path) -> str:
     """Returns the main result of a study in one line."""
     results = Results.read(study, runs, folder)
     answer = study.answer
-    measure = answer.measure or (results.measures or [""])[0]
     counts: dict[str, tuple[int, int]] = {}
-    wanted = {"setting": answer.setting, "task": answer.task, "measure": measure}
+    wanted = {name: getattr(answer, name) for name in ("setting", "learner", "task")}
     for row in results.rows:
-        if all(value in ("", row[name]) for name, value in wanted.items()):
+        measure = answer.measure or results.success[row["setting"]]
+        if row["measure"] == measure and all(
+            value in ("", row[name]) for name, value in wanted.items()
+        ):
             solved, total = counts.get(row["method"], (0, 0))
             episodes = int(row["episodes"])
             solved += round(float(row["value"]) * episodes)
@@ -289,17 +299,16 @@ def _figure(results: Results, learner: str, title: str) -> Any:
     groups = [group for group in results.groups if group[1] == learner]
     methods = list(dict.fromkeys(group[2] for group in groups))
     settings = list(dict.fromkeys(group[0] for group in groups))
-    measure = results.measures[0]
     labels = {run.method: _label(run) for run in results.runs}
     if len(settings) > 1 and all(map(_is_number, settings)):
-        draw, width = _draw_lines, 5.2
+        draw, width = _draw_lines, 6.4
         places = {s: (s, None) for s in sorted(settings, key=float)}
     else:
         draw = _draw_bars
         if len(settings) > 1:
             places = {name_label(s): (s, None) for s in settings}
         else:
-            tasks = results.tasks(settings[0], measure)
+            tasks = results.tasks(settings[0], results.success[settings[0]])
             places = {name_label(t): (settings[0], [t]) for t in tasks}
         width = max(3.6, 1.5 + 0.42 * len(places) * len(methods))
     figure = new_figure(width, 3.4)
@@ -309,7 +318,11 @@ def _figure(results: Results, learner: str, title: str) -> Any:
             place: mean
             for place, (setting, tasks) in places.items()
             if (setting, learner, method) in groups
-            and (mean := results.mean((setting, learner, method), measure, tasks))
+            and (
+                mean := results.mean(
+                    (setting, learner, method), results.success[setting], tasks
+                )
+            )
         }
         draw(axes, list(places), found, number, len(methods), labels[method])
     axes.set_ylim(0, 1.1)
@@ -318,7 +331,7 @@ def _figure(results: Results, learner: str, title: str) -> Any:
         figure,
         axes,
         methods=len(methods),
-        ylabel=f"{name_label(measure)}, test starts",
+        ylabel="success, test starts",
         title=title,
     )
 
@@ -337,6 +350,7 @@ def _draw_lines(
         [mean.mean for mean in found.values()],
         color=colour(number),
         linewidth=1.8,
+        linestyle="--" if number >= NUM_COLOURS else "-",
         marker="o",
         markersize=3,
         label=label,
@@ -362,7 +376,9 @@ def _draw_bars(
     width = 0.8 / methods
     at = [places.index(p) + (number - (methods - 1) / 2) * width for p in found]
     means = [mean.mean for mean in found.values()]
-    axes.bar(at, means, 0.9 * width, color=colour(number), label=label)
+    hatch = "////" if number >= NUM_COLOURS else None
+    fill = {"facecolor": colour(number), "edgecolor": "white", "linewidth": 0}
+    axes.bar(at, means, 0.9 * width, label=label, hatch=hatch, **fill)
     ends = [(m.mean - m.low, m.high - m.mean) for m in found.values()]
     axes.errorbar(
         at,
@@ -401,6 +417,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         file.stem
         for file in sorted((CONF / "study").glob("*.yaml"))
         if (options.results / f"{file.stem}.csv").exists()
+        and load_study(file.stem).publish is not None  # else it is another table
     ]
     for name in names:
         study = load_study(name)

@@ -64,11 +64,13 @@ class Answer:
         text (str): what was counted.
         measure (str): the measure; empty for the first.
         setting (str): the setting; empty for all.
+        learner (str): the learner; empty for all.
         task (str): the task; empty for all.
     """
 
     text: str
     measure: str = ""
+    learner: str = ""
     setting: str = ""
     task: str = ""
 

@@ -29,11 +29,13 @@ SMALL_ENV = {
         "evaluate": {"episodes": 2, "tasks": ["kettle"]},
     },
     "fetch_push": {
-        "collect": {"expert": 3, "random": 7, "held_out": 2, "steps": 40},
+        "demonstrations": 3,
+        "collect": {"expert": 4, "random": 7, "held_out": 2, "steps": 100},
         "world_model": {"steps": 60, "eval_every": 30, "hidden_sizes": [32]},
         "transformer": {"steps": 20, "eval_every": 10, "layers": 1, "width": 16},
         "score": {"num_actions": 8},
         "truth": {"actions": 4, "oracle_actions": 3},
+        "augmentation": {"counterfactual_ratio": 0.5},
         "evaluate": {"episodes": 3, "validation_episodes": 2},
     },
     "ogbench_cube_double": {

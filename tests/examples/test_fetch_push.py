@@ -34,21 +34,24 @@ def environment(steps, cfg):
 
 def test_rows_are_three_to_seven(cfg, environment, steps):
     rows = environment.rows()
-    assert len(rows) == 400
-    assert (rows["source"] == 0).sum() == 120
+    assert len(rows) == 1000
+    assert (rows["source"] == 0).sum() == 300
     assert rows["next", "done"].sum() == 10
-    half = cfg.copy()
-    half.env.fraction = 0.5
-    steps.collect.collect(half)
-    rows = steps.parts.make_environment(half).rows()
-    # Whole episodes of both kinds: 1 or 2 of 3, 3 or 4 of 7.
-    assert len(rows) == 200
-    assert (rows["source"] == 0).any()
+    # The demonstrations end at their first success.
+    demonstrations = environment.demonstrations()
+    assert (demonstrations["next", "reward"] == 0).sum() == 3
+    assert demonstrations["next", "done"].sum() == 3
+    fewer = cfg.copy()
+    fewer.env.demonstrations = 1
+    steps.collect.collect(fewer)
+    rows = steps.parts.make_environment(fewer).rows()
+    assert len(rows) == 300
+    assert (rows["source"] == 0).sum() == 100
 
 
 def test_held_out_episodes_are_other_ones(environment):
     rows, held_out = environment.rows(), environment.held_out()
-    assert len(held_out) == 80
+    assert len(held_out) == 200
     gaps = torch.cdist(held_out["desired_goal"], rows["desired_goal"])
     assert gaps.min() > 1e-4
 
@@ -63,7 +66,7 @@ def test_scores_and_their_report(environment):
     assert truth[expert][:, 1:].any()
     assert truth[expert][:, 1:].mean() > truth[~expert][:, 1:].mean()
     graph = rows["coda", "graph"]
-    assert graph.shape == (400, 4, 3)
+    assert graph.shape == (1000, 4, 3)
     assert (graph.sum(-2) < 1.001).all() and (graph >= 0).all()
     torch.testing.assert_close(rows["coda", "action"], graph[:, -1])
     report = json.loads((environment.folder / "influence.json").read_text())
@@ -243,7 +246,7 @@ def test_other_settings_are_not_mixed(cfg, steps):
         with pytest.raises(ValueError, match=f"other settings.*{name}.* differ"):
             steps.evaluate.evaluate(other, "caiac", 1)
     other = cfg.copy()
-    other.env.truth.threshold = 0.01
+    other.env.truth.actions = 5
     with pytest.raises(ValueError, match=r"other settings.*truth\.json"):
         steps.score.score(other)
 
@@ -304,6 +307,7 @@ def test_rows_mixed_from_other_episodes_are_refused(cfg, environment, steps):
 def test_motor_plans_learn_from_the_same_data(cfg, steps, compose):
     """A learner is not tied to an environment."""
     lmp = compose("env=fetch_push", "learner=lmp", "method=[caiac]", out=cfg.out)
+    steps.score.score(lmp)
     steps.train.train(lmp, "caiac", seed=11)
     (evaluation,) = steps.evaluate.evaluate(lmp, "caiac", seed=11)
     assert evaluation.step == 12

@@ -553,3 +553,22 @@ def test_differences_are_paired_by_seed(steps, study):
     report = (study.results / "try.md").read_text()
     assert "| none | 2 | 0.10 [0.00, 0.20] |  |" in report
     assert "| other | 2 | 0.60 [0.50, 0.70] | +0.50 [+0.50, +0.50] |" in report
+
+
+def test_settings_may_have_measures_of_their_own(steps, study, capfd):
+    study.write(answer={"text": "all", "learner": "counting"})
+    study.run("seeds=0")
+    rows = study.rows()
+    for row in rows:
+        if row["setting"] == "8":
+            row["measure"] = "full"
+    study.table.unlink()
+    steps.results.add_rows(study.table, rows)
+    study.run("seeds=0")
+    lines = (study.results / "try.md").read_text().splitlines()
+    assert lines[0].endswith("| seeds | success | full | success, minus none |")
+    assert lines[3] == "| 4 | counting | other | 1 | 0.40 |  | +0.00 |"
+    assert lines[5] == "| 8 | counting | other | 1 |  | 0.40 | +0.00 |"
+    assert lines[13] == "| 8 | counting | none | 0.40 | 0.40 |"
+    out = capfd.readouterr().out
+    assert out.splitlines()[-1] == "all: 8/20 (none), 8/20 (other)"
