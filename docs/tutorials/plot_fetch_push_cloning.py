@@ -128,12 +128,12 @@ for name, share in zip(layout.names[1:], moves.float().mean(0), strict=True):
     print(f"{name} moves in {share:.0%} of the rows")
 
 # %%
-# An action has a reason
-# ----------------------
+# Lookahead
+# ---------
 # While the gripper flies to a cube, nothing moves yet. If this cube were swapped, the
-# action would go to a place where no cube is any more, and a policy that clones it
-# would learn nonsense. With ``lookahead="next"`` the transform also leaves the cube
-# alone that is influenced *next* in the trajectory. The other one is free.
+# action would go to a place where no cube is any more, and so would a policy that
+# clones it. With ``lookahead="next"`` the transform does not swap the cube either that
+# is influenced *next* in the trajectory. The other one may be swapped.
 #
 # To show the difference, we make all rows counterfactual, and sample each row once.
 
@@ -284,7 +284,7 @@ for name, rollouts in played.items():
     )
 
 # %%
-# The counterfactuals help if they leave the actions a reason, and only then.
+# Counterfactuals help only if the cube that an action is for stays where it is.
 #
 # The first eight starts from above. Lines show where the cubes were pushed, squares are
 # the cubes at the end, stars their goals, and the grey line is the gripper.
