@@ -146,11 +146,6 @@ def _successes(
             "for each transition"
         )
     leaf = leaf.as_subclass(torch.Tensor).reshape(-1).cpu()
-    if leaf.is_floating_point() and bool(leaf.isnan().any()):
-        raise ValueError(
-            f"{key!r} is NaN in {int(leaf.isnan().sum())} of {len(leaf)} transitions: "
-            "remove or repair them"
-        )
     if above is not None:
         if isinstance(above, bool) or not isinstance(above, Real):
             raise TypeError(f"above must be a number, got {above!r}")
