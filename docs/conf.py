@@ -26,7 +26,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "tutorials"]
+exclude_patterns = ["_build", "tutorials", "results"]  # tables that pages include
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 
 # The reference lists the names in the __all__ of every subpackage, and nothing else.

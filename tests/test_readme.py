@@ -16,11 +16,16 @@ import torch
 from minari.data_collector import EpisodeBuffer
 from tensordict import TensorDictBase
 from torchrl.data import HERReplayBuffer, SliceSampler, TensorStorage
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import BCLoss, SoftUpdate
 
 from tests.influence.scoring import ready
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
-from torchrl_caiac.data import load_transitions, mix_trajectories, offline_buffer
+from torchrl_caiac.data import (
+    load_transitions,
+    mix_trajectories,
+    offline_buffer,
+    select_successful,
+)
 from torchrl_caiac.evaluation import (
     Candidate,
     compare_influence,
@@ -195,11 +200,49 @@ def test_hindsight_goals_and_td3(scored: TensorDictBase) -> None:
     assert loss["loss_actor"].isfinite()
     assert loss["loss_qvalue"].isfinite()
     loss = run_usage(
-        "loss = GoalConditionedTD3Loss", actor=scope["actor"], critics=scope["critics"]
+        'batch["no_reason"]',
+        batch=batch,
+        actor=scope["actor"],
+        critics=scope["critics"],
     )["loss"]
+    assert batch["no_reason"].any()
+    assert not batch["no_reason"].all()
     loss.make_value_estimator(gamma=0.97)
     SoftUpdate(loss, tau=0.005)
     assert loss(batch)["bc_loss"].isfinite()
+
+
+@in_memory
+def test_cloning(flat_data: TensorDictBase) -> None:
+    flat_data["next", "reward"] = -torch.ones(len(flat_data), 1)
+    flat_data["next", "reward"][9::10] = 0.0
+    data = flat_data
+    features = GoalFeatures(LAYOUT)
+    features.fit_statistics(data)
+    scope = run_usage(
+        "data = select_successful(data",
+        data=data,
+        actor=GoalConditionedActor(features, data["action"].shape[-1]),
+        steps=10,
+        torch=torch,
+        BCLoss=BCLoss,
+        MotionInfluence=MotionInfluence,
+        select_successful=select_successful,
+    )
+    batch = scope["rb"].sample()
+    assert batch["caiac", "counterfactual"].sum() == round(0.8 * 256)
+    assert scope["loss_module"](batch)["loss_bc"].isfinite()
+
+
+@in_memory
+def test_successful_episodes(flat_data: TensorDictBase) -> None:
+    flat_data["next", "reward"] = -torch.ones(len(flat_data), 1)
+    flat_data["next", "reward"][9::10] = 0.0
+    flat_data["next", "success"] = flat_data["next", "reward"] > -0.5
+    scope = run_usage(
+        "demonstrations = ", data=flat_data, select_successful=select_successful
+    )
+    assert 0 < len(scope["demonstrations"]) < len(flat_data)
 
 
 @in_memory

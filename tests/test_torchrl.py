@@ -20,12 +20,16 @@ from torchrl.data import (
     LazyTensorStorage,
     ListStorage,
     ReplayBuffer,
+    SliceSampler,
+    TensorDictReplayBuffer,
     TensorStorage,
 )
 from torchrl.objectives import LossModule
 
 import torchrl_caiac
 from torchrl_caiac import _torchrl as fence
+from torchrl_caiac._torchrl import sampled_rows, sampling_buffer
+from torchrl_caiac.trajectories import flat_rows
 
 PACKAGE = Path(torchrl_caiac.__file__).parent
 FOREIGN = {"torch", "torchrl", "tensordict"}
@@ -209,6 +213,33 @@ def test_last_written(tmp_path):
         storage=TensorStorage(rows(3)), writer=ImmutableDatasetWriter()
     )
     assert fence.last_written(dataset) is None
+
+
+def test_a_transform_finds_the_rows_of_its_batch():
+    for options in (
+        {},
+        {"prefetch": 2},
+        {"sampler": SliceSampler(slice_len=2, traj_key="episode")},
+    ):
+        seen = []
+
+        def look(td, seen=seen):
+            seen.append((sampled_rows(), td["row"].clone()))
+            return td
+
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(20), batch_size=6, **options
+        )
+        episode = torch.arange(20) // 5
+        buffer.extend(TensorDict({"row": torch.arange(20), "episode": episode}, [20]))
+        buffer.append_transform(look)
+        for _ in range(4):
+            buffer.sample()
+        for found, row in seen:
+            assert found is not None and found[0] is buffer
+            assert torch.equal(flat_rows(found[1], buffer.storage), row)
+            assert sampling_buffer() is None
+    assert sampled_rows() is None
 
 
 def test_prefetched_batches_are_dropped(rb):

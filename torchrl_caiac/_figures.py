@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -158,5 +159,6 @@ def finish_results(
             break
         legend.remove()
     if title:
-        axes.set_title(title, fontsize=11, loc="left")
+        letters = int(9 * figure.get_figwidth())  # that fit into a line
+        axes.set_title(textwrap.fill(title, letters), fontsize=11, loc="left")
     return figure

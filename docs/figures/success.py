@@ -3,7 +3,6 @@
 The figures of the results page::
 
     cd docs
-    python figures/success.py results/study.json images/kitchen_success.png
     python figures/success.py results/kitchen_all_tasks.json \\
         images/kitchen_all_tasks_success.png
 """

@@ -158,7 +158,8 @@ figure
 # But an object that the robot is *about* to move is the reason for its actions. With
 # ``lookahead=100`` the score of a row is the highest one of the rest of its
 # demonstration, so this object is kept. The cabinet, which the robot never touches, may
-# still be swapped.
+# still be swapped. ``CAIACTransform(..., lookahead=100)`` does the same without new
+# scores.
 
 WINDOW = 10
 objects = ("microwave", "kettle", "slide_cabinet")
