@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs.ogbench import make_ogbench_env, ogbench_cube_reward
+from torchrl_caiac.transforms import HindsightGoal
 
 CENTRE = np.array([0.425, 0.0, 0.0])
 CUBES = (19, 28)
@@ -183,7 +184,7 @@ def test_learners_of_values_sample_all_episodes(steps, compose, cfg):
     rb = made.make_buffer(made.rows())
     batch = rb.sample()
     # With p = 0.2, the default, goals would be 5 steps away.
-    (goals,) = [t for t in rb.transform if type(t).__name__ == "HindsightGoal"]
+    (goals,) = [t for t in rb.transform if isinstance(t, HindsightGoal)]
     assert goals.future == 0.7 and goals.p == 0.01
     assert batch["hindsight", "relabeled"].float().mean() > 0.6
     cfg.learner.successful = 0.7

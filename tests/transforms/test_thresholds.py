@@ -310,3 +310,11 @@ def test_numbers_of_numpy(kind) -> None:
     layout = EntityLayout({"a": [0], "b": [1]})
     for given in (kind(0), {"a": kind(0), "b": kind(0)}):
         CAIACTransform(layout, threshold=given)
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int64])
+@pytest.mark.parametrize("given", [0.5, {"a": 0.5, "b": 0.5}])
+def test_flags_are_compared_with_fractions(dtype, given) -> None:
+    transform = CAIACTransform(EntityLayout({"a": [0], "b": [1]}), threshold=given)
+    scores = torch.tensor([[0, 1], [1, 0]], dtype=dtype)
+    assert torch.equal(transform.swappable(scores), scores == 0)

@@ -85,8 +85,9 @@ class CAIACTransform(CounterfactualTransform):
             either, nor is it a donor. A number L: nor are entities that are influenced
             in one of the L states after the row (or after the last row of the window).
             ``None``: only the row's own score counts, as in Algorithm 1. It reads the
-            trajectories of the buffer that samples, and of the donor buffer, with one
-            byte for each of their rows and entities. Defaults to ``None``.
+            trajectories of the buffer that samples (one buffer, no
+            :class:`~torchrl.data.ReplayBufferEnsemble`), and of the donor buffer, with
+            one byte for each of their rows and entities. Defaults to ``None``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
             Defaults to the rows of the same batch. A donor buffer needs scores and the
             same layout. It is pickled with the transform.
