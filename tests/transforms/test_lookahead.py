@@ -14,6 +14,7 @@ from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
     PrioritizedSampler,
+    RandomSampler,
     ReplayBuffer,
     ReplayBufferEnsemble,
     SamplerWithoutReplacement,
@@ -22,6 +23,7 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 
+from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.evaluation import swap_shares
 from torchrl_caiac.influence import score_buffer
@@ -465,4 +467,43 @@ def test_rows_on_a_gpu(where) -> None:
     rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
     batch = rb.sample()
     assert batch["caiac", "swapped"].is_cuda
+    assert_kept(batch.cpu(), locks(influenced, episode))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("unscored", ["raise", "keep"])
+def test_reordered_rows_on_a_gpu_are_refused_late(unscored) -> None:
+    influenced, episode = make_influenced()
+    rb = ReplayBuffer(storage=LazyTensorStorage(120, device="cuda"), batch_size=60)
+    rb.extend(make_rows(influenced, episode).to("cuda"))
+    rb.append_transform(lambda td: td.flip(0))
+    rb.append_transform(CAIACTransform(LAYOUT, lookahead="next", unscored=unscored))
+    with pytest.raises(ValueError, match="other rows than the buffer drew"):
+        for _ in range(20):
+            rb.sample()
+            torch.cuda.synchronize()
+
+
+class RowsOnDevice(RandomSampler):
+    """Draws rows on the device of the storage."""
+
+    def sample(self, storage, batch_size):
+        rows = torch.randint(len(storage), (batch_size,), device=storage.device)
+        return rows, {}
+
+
+@pytest.mark.gpu
+def test_the_gpu_is_not_waited_for() -> None:
+    influenced, episode = make_influenced()
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(120, device="cuda"),
+        sampler=RowsOnDevice(),
+        batch_size=60,
+    )
+    rb.extend(make_rows(influenced, episode).to("cuda"))
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    for _ in range(2):
+        rb.sample()  # builds what is built once
+    with nothing_waits():
+        batch = rb.sample()
     assert_kept(batch.cpu(), locks(influenced, episode))

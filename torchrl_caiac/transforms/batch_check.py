@@ -43,7 +43,8 @@ class CheckedScores(NamedTuple):
         scores (torch.Tensor): ``[B * window, ...]``, NaN where they may not be used.
         unscored (torch.Tensor, optional): int64, the number of such rows, if counted.
         is_wrong (torch.Tensor, optional): bool, whether a row has the score of another
-            state; on accelerators, where it is not read at once.
+            state, or with lookahead is another one than the buffer drew; on
+            accelerators, where it is not read at once.
         crosses (torch.Tensor, optional): bool ``[B, window - 1]``, the steps of windows
             that are not steps of a trajectory.
     """
@@ -172,8 +173,9 @@ class BatchCheck:
             raise ValueError(
                 f"{[names[place] for place in found]} were invalid in an earlier "
                 f"batch: {self.scores_name} or observations are NaN or infinite, "
-                f"{self.scores_name} are those of other states, or windows cross a "
-                "trajectory's end. On a CUDA device errors are late; sample the same "
+                f"{self.scores_name} are those of other states or, with lookahead, of "
+                "other rows than the buffer drew, or windows cross a trajectory's "
+                "end. On a CUDA device errors are late; sample the same "
                 "data on the CPU to find the rows"
             )
         scores = checked.scores

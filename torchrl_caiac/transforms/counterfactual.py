@@ -466,8 +466,12 @@ class CounterfactualTransform(RandomTransform, ABC):
             checked = self._batch_check.before(tensordict, scores)
             scores = checked.scores
         if self._lookahead is not None:
-            locked = self._locked(tensordict, self._lookahead)
+            locked, differs = self._locked(tensordict, self._lookahead)
             scores = hold_entities(scores, locked)
+            if differs is not None and checked is not None:
+                wrong = checked.is_wrong
+                wrong = differs if wrong is None else wrong | differs
+                checked = checked._replace(is_wrong=wrong)
         if not self._free_share.is_done:
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)
@@ -486,8 +490,10 @@ class CounterfactualTransform(RandomTransform, ABC):
         self._no_donor += draw.no_donor
         return out if len(shape) == 1 else out.reshape(shape)
 
-    def _locked(self, td: TensorDictBase, lookahead: Lookahead) -> torch.Tensor:
-        """Returns the entities that the rows of a batch lock, bool ``[B, N]``."""
+    def _locked(
+        self, td: TensorDictBase, lookahead: Lookahead
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Returns what the rows of a batch lock, see :meth:`Lookahead.locked`."""
         found = sampled_rows()
         if found is None:
             raise RuntimeError(

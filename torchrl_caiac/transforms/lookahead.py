@@ -268,18 +268,19 @@ class Lookahead:
 
     def locked(
         self, source: ReplayBuffer, index: Any, batch: TensorDictBase
-    ) -> torch.Tensor:
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Returns what the rows of a batch lock.
 
         Args:
             source (ReplayBuffer): the buffer that samples.
             index (torch.Tensor or tuple): the rows that it drew.
             batch (TensorDictBase): the batch, ``[B]``. Its scores, and fingerprints if
-                there are any, are compared with those of the rows, but not on an
-                accelerator, since that would wait for it.
+                there are any, are compared with those of the rows.
 
         Returns:
-            torch.Tensor: bool ``[B, N]``.
+            tuple of torch.Tensor: bool ``[B, N]``; and on an accelerator, which is not
+            waited for, bool ``[]``, whether the batch consists of other rows, else
+            ``None``.
 
         Raises:
             RuntimeError: the batch does not consist of these rows, or those of several
@@ -294,13 +295,15 @@ class Lookahead:
             )
         table, rows = self.table(source), flat_rows(index, storage)
         device = batch.get(self.score_key).device
+        late, differs = LateCheck.needed(device), None
         same = len(rows) == len(batch)
-        if same and not LateCheck.needed(device):
+        if same:
             data = storage_rows(storage)
-            same = all(
-                _is_same(batch.get(key, None), data.get(key, None), rows)
-                for key in (self.score_key, fingerprint_key(self.score_key))
-            )
+            differs = _differs(batch, data, rows, self.score_key)
+            known = fingerprint_key(self.score_key)
+            if all(td.get(known, None) is not None for td in (batch, data)):
+                differs = differs | _differs(batch, data, rows, known)
+            same = late or not bool(differs)
         if not same:
             raise RuntimeError(
                 "the batch does not have the rows that the buffer drew, so that the "
@@ -308,7 +311,7 @@ class Lookahead:
                 "others that select, repeat or reorder rows, leave out prefetch if "
                 "rows are replaced while batches are prefetched, or leave out lookahead"
             )
-        return pick_rows(table, rows).to(device)
+        return pick_rows(table, rows).to(device), differs if late else None
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: self.__dict__[key] for key in self.__dict__ if key != "_tables"}
@@ -318,11 +321,10 @@ class Lookahead:
         self.refresh()
 
 
-def _is_same(
-    leaf: torch.Tensor | None, stored: torch.Tensor | None, rows: torch.Tensor
-) -> bool:
-    """Returns whether a leaf of a batch has the stored values of rows."""
-    if leaf is None or stored is None:  # nothing to compare
-        return True
-    found = pick_rows(plain_tensor(stored), rows).to(leaf)
-    return torch.equal(found.nan_to_num(), leaf.nan_to_num())
+def _differs(
+    batch: TensorDictBase, data: TensorDictBase, rows: torch.Tensor, key: NestedKey
+) -> torch.Tensor:
+    """Returns whether a leaf of a batch has other values than rows of the data."""
+    leaf = batch.get(key)
+    found = pick_rows(plain_tensor(data.get(key)), rows).to(leaf)
+    return (found.nan_to_num() != leaf.nan_to_num()).any()
