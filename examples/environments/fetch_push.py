@@ -49,7 +49,8 @@ class FetchPush(Environment):
 
     ``rows`` are the demonstrations, whole, and random episodes; ``demonstrations`` are
     the demonstrations up to their first success. ``held_out`` are episodes with other
-    seeds, which only check the scores.
+    seeds, which only check the scores. With ``null``, ``rows`` are all episodes of the
+    expert, successful or not, and all random ones, and there are no demonstrations.
     """
 
     layout = LAYOUT
@@ -63,7 +64,8 @@ class FetchPush(Environment):
     @property
     def folder(self) -> Path:
         """The folder of this number of demonstrations."""
-        return self.out / f"demonstrations-{self.settings.demonstrations}"
+        number = self.settings.demonstrations
+        return self.out / ("all" if number is None else f"demonstrations-{number}")
 
     @property
     def cubes(self) -> dict[str, float]:
@@ -101,6 +103,9 @@ class FetchPush(Environment):
             load_minari(dataset, out / name, infos=["simulator"], progress=progress)
         self._mix(out / "held_out", ("held_out_expert", "held_out_random"))
         number, folder = self.settings.demonstrations, self.folder
+        if number is None:
+            self._mix(folder / "rows", ("expert", "random"))
+            return
         source = {"expert": data_digest(out / "expert"), "demonstrations": number}
         keep_settings(folder, "demonstrations_source", source)
         expert = load_transitions(out / "expert")
@@ -149,6 +154,11 @@ class FetchPush(Environment):
 
     def demonstrations(self) -> TensorDictBase:
         """Returns the demonstrations up to their first success."""
+        if self.settings.demonstrations is None:
+            raise ValueError(
+                "env.demonstrations is null, so that there are none to imitate: set "
+                "how many successful episodes to learn from"
+            )
         return load_transitions(self.folder / "demonstrations")
 
     def simulator(self, num_actions: int) -> SimulatorInfluence:
