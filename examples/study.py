@@ -267,7 +267,7 @@ def git_commit() -> str:
 
 
 def missing_runs(options: Options, runs: Sequence[Run]) -> list[Run]:
-    """Returns the wanted runs that the table lacks, with room made for them.
+    """Returns the wanted runs that the table lacks; removes outdated results if asked.
 
     Raises:
         ValueError: the table has results of other settings, or of runs that the study
@@ -319,8 +319,7 @@ def run_study(options: Options, console: Console) -> None:
     elif needed:
         with console.stage(f"preparation of {len(needed)} settings"):
             jobs = [(cfg,) for cfg in needed]
-            for _ in run_in_processes(prepare, jobs, processes=options.processes):
-                pass
+            list(run_in_processes(prepare, jobs, processes=options.processes))
     ended: Counter[str] = Counter()
     if missing:
         commit = git_commit()

@@ -51,7 +51,7 @@ def from_stream(
         stream (iterable of mapping): mappings with the arguments of
             :func:`from_arrays` for arrays: ``"observations"``, ``"actions"`` and, in
             all mappings or in none, the others. Each is read once, before the next
-            one is asked for, so that a stream may reuse its arrays.
+            one is requested. Afterwards, the stream may overwrite its arrays.
         path (path): the folder to write. It is written atomically.
 
     Keyword Args:

@@ -60,8 +60,10 @@ def check_lookahead(lookahead: object) -> LookaheadArgument:
         >>> check_lookahead("next")
         'next'
     """
-    if lookahead is None or (isinstance(lookahead, str) and lookahead == "next"):
-        return lookahead  # type: ignore[return-value]
+    if lookahead is None:
+        return None
+    if isinstance(lookahead, str) and lookahead == "next":
+        return "next"
     if isinstance(lookahead, bool) or not isinstance(lookahead, int):
         raise TypeError(
             f"lookahead must be a number of steps, 'next' or None, got {lookahead!r}"
