@@ -160,7 +160,7 @@ class ScoreParts:
             folder (path): the folder of the data.
             key (NestedKey): the leaf.
         """
-        return cls(score_file(folder, key).with_suffix(_SUFFIX))
+        return cls(score_file(Path(folder), key).with_suffix(_SUFFIX))
 
     # --- who takes part ---------------------------------------------------------------
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -43,10 +44,11 @@ __all__ = [
 _UNKNOWN = 1e30
 
 
-class ScorePass(NamedTuple):
+@dataclass(frozen=True)
+class ScorePass:
     """One pass over a buffer.
 
-    Attributes:
+    Args:
         storage (TensorStorage): the storage.
         data (TensorDictBase): its rows, ``[capacity]``.
         index (TrajectoryIndex): the trajectories.
@@ -90,8 +92,9 @@ def existing_scores(
     Raises:
         ValueError: the scores are of another origin or have other settings.
     """
-    storage, data, index, scorer, layout, key, settings, _ = own
-    leaves = find_leaves(storage, key)
+    data, index, scorer = own.data, own.index, own.scorer
+    layout, key, settings = own.layout, own.key, own.settings
+    leaves = find_leaves(own.storage, key)
     record = own.read_record()
     if record is not None and record["state"] == "new":
         return None  # interrupted before the leaves were initialized
