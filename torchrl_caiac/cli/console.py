@@ -52,6 +52,7 @@ class Console:
 
     def __init__(self, *, as_json: bool = False, debug: bool = False) -> None:
         self.as_json, self.debug = as_json, debug
+        self.is_quiet = False
         self.warnings: list[str] = []
         self._out, self._err = sys.stdout, sys.stderr
         self._is_terminal = False
@@ -138,7 +139,13 @@ class Console:
 
     # --- redirection -----------------------------------------------------------------
 
+    def be_quiet(self) -> None:
+        """Writes nothing from now on but errors, as another process writes the rest."""
+        self.is_quiet, self.as_json, self._is_terminal = True, False, False
+
     def _write(self, stream: TextIO, text: str) -> None:
+        if self.is_quiet and not text.startswith("error: "):
+            return
         stream.write(text)
         stream.flush()
 

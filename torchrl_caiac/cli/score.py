@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from torchrl.data import ReplayBuffer
 
 from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.check import check_dataset
@@ -29,14 +33,15 @@ from torchrl_caiac.cli.sources import (
     read_layout,
     remove_scores,
 )
-from torchrl_caiac.data import action_bounds, offline_buffer
+from torchrl_caiac.cli.workers import Ranks, ranks_of_torchrun, score_in_workers
+from torchrl_caiac.data import action_bounds, load_transitions, offline_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence import (
     action_coverage,
     score_buffer,
     suggest_thresholds,
 )
-from torchrl_caiac.scored import ScoredDataset, write_scored
+from torchrl_caiac.scored import DATA_FOLDER, ScoredDataset, write_scored
 
 __all__ = ["add_parser", "run"]
 
@@ -45,7 +50,9 @@ _FILES = (".npz", ".npy", ".hdf5", ".h5", ".json", ".yaml", ".yml", ".html")
 _EPILOG = """\
 example:
   caiac score episodes.npz --layout ogbench/cube-double --out scored
-To resume an interrupted call, repeat it.
+To resume an interrupted call, repeat it. In several processes, on one machine or more:
+  caiac score ... --workers 2
+  torchrun --nproc-per-node=2 -m torchrl_caiac score ...
 """
 
 
@@ -84,6 +91,14 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         "(default: %(default)s)",
     )
     group.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="score in N processes on this machine, with one thread each (default: "
+        "%(default)s)",
+    )
+    group.add_argument(
         "--overwrite",
         action="store_true",
         help="replace the output of an earlier call with other data or settings",
@@ -94,6 +109,46 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Runs the command."""
+    ranks = ranks_of_torchrun()
+    if args.workers < 1:
+        raise UsageError("--workers must be at least 1")
+    if ranks is None:
+        return _run(args, console, None)
+    if args.workers > 1:
+        raise UsageError("--workers is for a call without torchrun: leave it out")
+    if ranks.rank:
+        console.be_quiet()
+    with ranks.connected():
+        if ranks.rank:
+            return _take_part(ranks)
+        sent = False
+
+        def send(value: Any) -> None:
+            nonlocal sent
+            sent = True
+            ranks.send(value)
+
+        try:
+            return _run(args, console, (ranks, send))
+        except BaseException as error:
+            if not sent:
+                ranks.send_failure(error)
+            raise
+
+
+_Team = tuple[Ranks, Callable[[Any], None]]
+
+
+def _take_part(ranks: Ranks) -> int:
+    """Scores what the first process of ``torchrun`` has prepared."""
+    folder, estimator, arguments = ranks.receive()
+    rb = offline_buffer(load_transitions(folder))
+    with _no_default_threshold():
+        score_buffer(rb, ranks.on_device(estimator), shard=ranks.shard, **arguments)
+    return OK
+
+
+def _run(args: argparse.Namespace, console: Console, team: _Team | None) -> int:
     layout = read_layout(args.layout, console)
     for name, least in (("lookahead", 0), ("smoothing", 1)):
         if getattr(args, name) < least:
@@ -123,7 +178,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             settings,
             console,
         )
-        scored = _score(args, context, described, replace=replace)
+        scored = _score(args, context, described, team, replace=replace)
     _show(scored, console)
     return OK
 
@@ -186,6 +241,7 @@ def _score(
     args: argparse.Namespace,
     context: Context,
     described: dict[str, Any],
+    team: _Team | None,
     *,
     replace: bool,
 ) -> ScoredDataset:
@@ -201,9 +257,8 @@ def _score(
     for finding in report.warnings:
         console.warn(f"{finding.message} ({finding.code}; to do: {finding.remedy})")
     estimator = ESTIMATORS[args.estimator].make(context)
-    rb = offline_buffer(data)
     with console.step("scoring"):
-        _write_scores(rb, estimator, context, replace=replace)
+        rb = _write_scores(args.workers, estimator, context, team, replace=replace)
     with console.step("suggesting thresholds"):
         suggestions = suggest_thresholds(rb, layout)
     coverage = _coverage(context)
@@ -219,24 +274,51 @@ def _score(
     )
 
 
-def _write_scores(rb: Any, estimator: Any, context: Context, *, replace: bool) -> None:
+def _write_scores(
+    workers: int,
+    estimator: Any,
+    context: Context,
+    team: _Team | None,
+    *,
+    replace: bool,
+) -> ReplayBuffer:
     arguments: dict[str, Any] = {
         "smoothing": context.settings["smoothing"],
         "lookahead": context.settings["lookahead"],
         "check": False,
         "progress": context.console.progress,
     }
+    folder = context.folder / DATA_FOLDER
+    rb = offline_buffer(context.data)
+    with _no_default_threshold():
+        if team is not None:
+            ranks, send = team
+            arguments["overwrite"] = replace
+            send((folder.resolve(), estimator, {**arguments, "progress": False}))
+            estimator = ranks.on_device(estimator)
+            score_buffer(rb, estimator, shard=ranks.shard, **arguments)
+        elif workers > 1:
+            arguments["overwrite"] = replace
+            score_in_workers(folder, estimator, workers, arguments)
+            rb = offline_buffer(load_transitions(folder))
+        else:
+            try:
+                score_buffer(rb, estimator, **arguments)
+            except ValueError:
+                # Of other settings, which --overwrite has replaced; an interrupted call
+                # that has begun to replace them does not come here, and resumes.
+                if not replace:
+                    raise
+                score_buffer(rb, estimator, overwrite=True, **arguments)
+    return rb
+
+
+@contextmanager
+def _no_default_threshold() -> Iterator[None]:
+    """Thresholds are suggested next, and shown with what they make swappable."""
     with warnings.catch_warnings():
-        # Thresholds are suggested next, and shown with what they make swappable.
         warnings.filterwarnings("ignore", message="with the default threshold")
-        try:
-            score_buffer(rb, estimator, **arguments)
-        except ValueError:
-            # Of other settings, which --overwrite has replaced; an interrupted call
-            # that has begun to replace them does not come here, and resumes.
-            if not replace:
-                raise
-            score_buffer(rb, estimator, overwrite=True, **arguments)
+        yield
 
 
 def _coverage(context: Context) -> dict[str, Any] | None:
