@@ -317,6 +317,12 @@ def draw_buffer_donors(
     pick = draw_integers(free.shape, device=device, generator=generator)
     pick = pick % size.clamp_min(1) + index.offset.to(device)
     found = size > 0
-    donors = index.rows(pick.to(index.offset.device)).to(device, torch.int64)
     swapped = is_chosen & found
+    home = index.offset.device
+    if isinstance(index, DonorBits) and {device.type, home.type} == {"cpu"}:
+        # Only what is needed: rows are searched for.
+        donors = torch.zeros(free.shape, dtype=torch.int64)
+        donors[swapped] = index.rows(pick[swapped])
+    else:
+        donors = index.rows(pick.to(home)).to(device, torch.int64)
     return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0), chosen=chosen)
