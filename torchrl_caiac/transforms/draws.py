@@ -91,7 +91,7 @@ class DonorBits(NamedTuple):
     @classmethod
     def of_words(cls, words: torch.Tensor) -> DonorBits:
         """Counts the rows in words, int16 ``[N, W]``."""
-        entities, width = words.shape
+        width = words.shape[1]
         counts, _ = _word_tables(words.device)
         dtype = torch.int32 if 16 * words.numel() < 1 << 31 else torch.int64
         before = torch.empty(words.numel(), dtype=dtype, device=words.device)
