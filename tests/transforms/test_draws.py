@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from torchrl_caiac.transforms.donors import eligible_starts
 from torchrl_caiac.transforms.draws import (
+    DonorIndex,
     draw_batch_donors,
     draw_buffer_donors,
     draw_windows,
@@ -129,3 +130,40 @@ def test_buffer_donors_are_uniform() -> None:
         assert share[begin:end].sum() == pytest.approx(1.0)
         assert (share[begin:end] - 1 / (end - begin)).abs().max() < 0.01
     assert draw.swapped.all() and not draw.no_donor.any()
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    rows=st.integers(1, 70),
+    share=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
+    seed=st.integers(0, 1000),
+)
+def test_bits_draw_what_lists_draw(rows: int, share: float, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    free = torch.rand(rows, 3, generator=generator) < share
+    bits = eligible_starts((~free).float(), 0.5, torch.ones(3, dtype=torch.bool))
+    lists = [column.nonzero()[:, 0] for column in free.unbind(1)]
+    size = torch.tensor([len(found) for found in lists])
+    starts = torch.cat(lists)
+    index = DonorIndex(
+        starts if len(starts) else torch.zeros(1).long(), size.cumsum(0) - size, size
+    )
+    assert bits.starts.tolist() == starts.tolist()
+    wanted, found = (
+        draw_buffer_donors(
+            torch.ones(200, 3, dtype=torch.bool),
+            donors,
+            generator=torch.Generator().manual_seed(seed),
+        )
+        for donors in (index, bits)
+    )
+    assert torch.equal(found.swapped, wanted.swapped)
+    assert torch.equal(found.donors[found.swapped], wanted.donors[wanted.swapped])
+
+
+def test_bits_need_less_than_half_a_byte_for_a_row() -> None:
+    rows = 200_000
+    bits = eligible_starts(torch.zeros(rows, 1), 0.5, torch.tensor([True]))
+    size = sum(leaf.numel() * leaf.element_size() for leaf in bits)
+    assert size <= 0.38 * rows
+    assert bits.rows(torch.tensor([0, 17, rows - 1])).tolist() == [0, 17, rows - 1]

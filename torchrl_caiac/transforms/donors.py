@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac._fingerprints import fingerprint_key, matches
@@ -15,7 +16,7 @@ from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
-from torchrl_caiac.transforms.draws import DonorIndex, SwapDraw, draw_buffer_donors
+from torchrl_caiac.transforms.draws import DonorBits, SwapDraw, draw_buffer_donors
 from torchrl_caiac.transforms.indexing import plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.lookahead import Lookahead, hold_entities
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["BufferDonors", "eligible_starts", "scan_donors"]
 
 # Rows of the storage that are read together while an index is built.
-_CHUNK = 1 << 20
+_CHUNK = 1 << 17
 
 
 def scan_donors(
@@ -81,12 +82,12 @@ def eligible_starts(
     *,
     window: int = 1,
     trajectories: TrajectoryIndex | None = None,
-) -> DonorIndex:
+) -> DonorBits:
     """Finds the rows at which windows start in which an entity is uninfluenced.
 
     All rows of such a window belong to one trajectory and have scores of at most
     ``threshold``; a row without a score (NaN) is never part of one. The index takes
-    4 bytes for each pair of row and entity that is eligible.
+    0.375 bytes for each pair of row and entity.
 
     Args:
         scores (torch.Tensor): ``[T, N]``, NaN where a row was not scored.
@@ -99,7 +100,7 @@ def eligible_starts(
         trajectories (TrajectoryIndex, optional): needed for windows of several rows.
 
     Returns:
-        DonorIndex: the rows of every entity.
+        DonorBits: the rows of every entity.
 
     Raises:
         ValueError: a score is infinite.
@@ -109,14 +110,16 @@ def eligible_starts(
         >>> from torchrl_caiac.transforms.donors import eligible_starts
         >>> scores = torch.tensor([[0.0], [0.2], [float("nan")], [0.01]])
         >>> eligible_starts(scores, 0.05, torch.tensor([True])).starts
-        tensor([0, 3], dtype=torch.int32)
+        tensor([0, 3])
     """
     length, entities = scores.shape
     device = scores.device
-    dtype = torch.int32 if length < 1 << 31 else torch.int64
-    found: list[list[torch.Tensor]] = [[] for _ in range(entities)]
+    words = torch.zeros(entities, -(-length // 16), dtype=torch.int16, device=device)
+    bits = (1 << torch.arange(16, device=device)).to(torch.int16)
+    is_in_order = trajectories is None or trajectories.is_storage_order
     chosen = swappable.nonzero()[:, 0].tolist()
-    for rows, part in scan_donors(scores, _CHUNK, window, trajectories, "scores"):
+    step = -(-_CHUNK // 16) * 16  # parts begin at whole words
+    for rows, part in scan_donors(scores, step, window, trajectories, "scores"):
         free = part <= threshold
         if window > 1 and trajectories is not None:
             held = (~free).cumsum(0, dtype=torch.int32)
@@ -124,15 +127,19 @@ def eligible_starts(
             free = before[window:] == before[:-window]
             rows = rows[: free.shape[0]]
             free &= (trajectories.remaining(rows) >= window - 1).unsqueeze(-1)
+        word = rows // 16
+        bit = bits[rows % 16]
         for entity in chosen:
-            found[entity].append(rows[free[:, entity]].to(dtype))
-    lists = [torch.cat(f) if f else torch.empty(0, dtype=dtype) for f in found]
-    lists = [rows.to(device) for rows in lists]
-    size = torch.tensor([rows.numel() for rows in lists], device=device)
-    starts = torch.cat(lists)
-    if not starts.numel():  # the index needs at least one row
-        starts = torch.zeros(1, dtype=dtype, device=device)
-    return DonorIndex(starts, size.cumsum(0) - size, size)
+            value = bit * free[:, entity]
+            if is_in_order:
+                value = pad(value, (0, -len(value) % 16)).view(-1, 16)
+                first = int(word[0])
+                words[entity, first : first + len(value)] = value.sum(
+                    -1, dtype=torch.int16
+                )
+            else:
+                words[entity].index_add_(0, word, value)
+    return DonorBits.of_words(words)
 
 
 class BufferDonors:

@@ -7,6 +7,7 @@ them, or the last ones), ``N`` the number of entities.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,7 @@ from torchrl_caiac._random import draw_integers, draw_numbers
 from torchrl_caiac.transforms.indexing import pick_rows, window_max, window_starts
 
 __all__ = [
+    "DonorBits",
     "DonorIndex",
     "SwapDraw",
     "draw_batch_donors",
@@ -60,6 +62,85 @@ class DonorIndex(NamedTuple):
     starts: torch.Tensor
     offset: torch.Tensor
     size: torch.Tensor
+
+    def rows(self, place: torch.Tensor) -> torch.Tensor:
+        """Returns the rows at places in ``starts``, integer ``[*]``."""
+        return pick_rows(self.starts, place.clamp(0, len(self.starts) - 1))
+
+
+class DonorBits(NamedTuple):
+    """The same as :class:`DonorIndex`, in a tenth of the memory.
+
+    A row is one bit, and each word of 16 bits has the number of rows before it: 0.375
+    bytes for each row and entity, whether it is eligible or not. The order of the rows
+    of an entity is that of the storage.
+
+    Attributes:
+        words (torch.Tensor): int16 ``[N * W]``, the words of the first entity, then of
+            the second, and so on.
+        before (torch.Tensor): integer ``[N * W]``, the rows in all words before.
+        offset (torch.Tensor): int64 ``[N]``, the number of rows of earlier entities.
+        size (torch.Tensor): int64 ``[N]``, the number of the entity's rows.
+    """
+
+    words: torch.Tensor
+    before: torch.Tensor
+    offset: torch.Tensor
+    size: torch.Tensor
+
+    @classmethod
+    def of_words(cls, words: torch.Tensor) -> DonorBits:
+        """Counts the rows in words, int16 ``[N, W]``."""
+        width = words.shape[1]
+        counts, _ = _word_tables(words.device)
+        dtype = torch.int32 if 16 * words.numel() < 1 << 31 else torch.int64
+        before = torch.empty(words.numel(), dtype=dtype, device=words.device)
+        total = torch.zeros((), dtype=torch.int64, device=words.device)
+        for start in range(0, words.numel(), _WORDS):
+            part = words.view(-1)[start : start + _WORDS]
+            count = counts[part.int() & 0xFFFF].long()
+            ahead = count.cumsum(0)
+            before[start : start + _WORDS] = ahead - count + total
+            total = total + ahead[-1]
+        offset = before[::width].long() if width else torch.zeros_like(before).long()
+        size = torch.cat([offset, total.view(1)]).diff()
+        return cls(words.reshape(-1), before, offset, size)
+
+    @property
+    def starts(self) -> torch.Tensor:
+        """All rows, as in :class:`DonorIndex`: one number for each."""
+        return self.rows(torch.arange(int(self.size.sum()), device=self.words.device))
+
+    def rows(self, place: torch.Tensor) -> torch.Tensor:
+        """Returns the rows at places among all rows, int64 ``[*]``."""
+        place = place.to(self.before).contiguous()
+        word = torch.searchsorted(self.before, place, right=True) - 1
+        word.clamp_min_(0)
+        _, bits = _word_tables(self.words.device)
+        rank = (place - pick_rows(self.before, word)).clamp(0, 15)
+        value = pick_rows(self.words, word).int() & 0xFFFF
+        bit = pick_rows(bits.view(-1), value * 16 + rank)
+        return word % (len(self.words) // len(self.size)) * 16 + bit
+
+
+# Words whose rows are counted together.
+_WORDS = 1 << 17
+
+
+@lru_cache(maxsize=8)
+def _word_tables(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the number of bits of each word, and the place of each set one.
+
+    uint8 ``[65536]`` and ``[65536, 16]``, 0 after the last one.
+    """
+    words = torch.arange(1 << 16)
+    counts = torch.zeros(1 << 16, dtype=torch.int64)
+    places = torch.zeros(1 << 16, 16, dtype=torch.uint8)
+    for bit in range(16):
+        having = words[(words >> bit) & 1 == 1]
+        places[having, counts[having]] = bit
+        counts[having] += 1
+    return counts.to(device, torch.uint8), places.to(device)
 
 
 def uninfluenced(
@@ -200,7 +281,7 @@ def draw_batch_donors(
 
 def draw_buffer_donors(
     free: torch.Tensor,
-    index: DonorIndex,
+    index: DonorIndex | DonorBits,
     *,
     swap_prob: float = 1.0,
     chosen: torch.Tensor | None = None,
@@ -210,7 +291,7 @@ def draw_buffer_donors(
 
     Args:
         free (torch.Tensor): bool ``[C, N]``, the entities that may be swapped.
-        index (DonorIndex): the eligible windows.
+        index (DonorIndex or DonorBits): the eligible windows.
 
     Keyword Args:
         swap_prob (float): probability of swapping a free entity. Defaults to 1.
@@ -234,10 +315,14 @@ def draw_buffer_donors(
     is_chosen = _drawn(free, swap_prob, chosen, generator)
     size = index.size.to(device)
     pick = draw_integers(free.shape, device=device, generator=generator)
-    pick = (pick % size.clamp_min(1) + index.offset.to(device)).clamp_max_(
-        index.starts.shape[0] - 1
-    )
+    pick = pick % size.clamp_min(1) + index.offset.to(device)
     found = size > 0
-    donors = pick_rows(index.starts, pick).to(device, torch.int64)
     swapped = is_chosen & found
+    home = index.offset.device
+    if isinstance(index, DonorBits) and {device.type, home.type} == {"cpu"}:
+        # Only what is needed: rows are searched for.
+        donors = torch.zeros(free.shape, dtype=torch.int64)
+        donors[swapped] = index.rows(pick[swapped])
+    else:
+        donors = index.rows(pick.to(home)).to(device, torch.int64)
     return SwapDraw(donors, swapped, (is_chosen ^ swapped).sum(0), chosen=chosen)

@@ -97,17 +97,28 @@ def steps_to_influence(
         [2, 1, 0, 2147483647]
     """
     length, device = trajectories.length, influenced.device
-    position = torch.arange(length, dtype=torch.int32, device=device)
-    rows = trajectories.rows(position.long().to(trajectories.device))
-    # The place of the last row of each row's trajectory, in the order of time.
-    last = position + trajectories.remaining(rows).to(device, torch.int32)
+    rows = trajectories.rows(torch.arange(length, device=trajectories.device))
+    left = trajectories.remaining(rows).to(device)
     rows = rows.to(device)
     steps = torch.empty(influenced.shape, dtype=torch.int32, device=device)
+    return steps.index_copy_(0, rows, _steps(influenced[rows], left))
+
+
+def _steps(influenced: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+    """Returns the steps of whole trajectories in the order of time, int32 ``[n, N]``.
+
+    Args:
+        influenced (torch.Tensor): bool ``[n, N]``.
+        left (torch.Tensor): integer ``[n]``, the later rows of each row's trajectory.
+    """
+    device = influenced.device
+    position = torch.arange(len(left), dtype=torch.int32, device=device)
+    last = position + left.to(torch.int32)
+    steps = torch.empty(influenced.shape, dtype=torch.int32, device=device)
     for entity in range(influenced.shape[1]):
-        here = influenced[:, entity].index_select(0, rows)
-        later = position.where(here, NEVER).flip(0).cummin(0).values.flip(0)
-        found = (later - position).where(later <= last, NEVER)
-        steps[:, entity].index_copy_(0, rows, found)
+        later = position.where(influenced[:, entity], NEVER).flip(0)
+        later = later.cummin(0).values.flip(0)
+        steps[:, entity] = (later - position).where(later <= last, NEVER)
     return steps
 
 
@@ -262,11 +273,27 @@ class Lookahead:
         trajectories = trajectory_index(
             source, trajectory_key=self.keys.trajectory, done_key=self.keys.done
         )
-        step = max(1, _CHUNK // scores[0].numel())
-        influenced = torch.cat([~self._free(part) for part in scores.split(step)])
-        steps = steps_to_influence(influenced, trajectories)
-        steps += own * ((steps > 0) & (steps < NEVER))
-        return locked_entities(steps, self.rule, self._competing().to(steps.device))
+        competing = self._competing().to(scores.device)
+        table = torch.empty(
+            len(scores), len(self.layout), dtype=torch.bool, device=scores.device
+        )
+        # Whole trajectories at a time, on which no others depend.
+        size = max(1, _CHUNK // scores[0].numel())
+        ends, start = trajectories.ends.cpu(), 0
+        while start < trajectories.length:
+            at = torch.searchsorted(ends, min(start + size, trajectories.length) - 1)
+            stop = int(ends[at]) + 1
+            position = torch.arange(start, stop, device=trajectories.device)
+            rows = trajectories.rows(position)
+            left = trajectories.remaining(rows).to(scores.device)
+            rows = rows.to(scores.device)
+            parts = rows.split(size)  # of a long trajectory
+            influenced = torch.cat([~self._free(scores[part]) for part in parts])
+            steps = _steps(influenced, left)
+            steps += own * ((steps > 0) & (steps < NEVER))
+            table[rows] = locked_entities(steps, self.rule, competing)
+            start = stop
+        return table
 
     def locked(
         self, source: ReplayBuffer, index: Any, batch: TensorDictBase
