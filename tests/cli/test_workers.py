@@ -30,7 +30,7 @@ def torchrun(*arguments: str, ranks: int) -> subprocess.CompletedProcess[str]:
         env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
 
