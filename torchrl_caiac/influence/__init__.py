@@ -21,6 +21,7 @@ from torchrl_caiac.influence.residual import ResidualInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
+from torchrl_caiac.influence.shards import ScoringProgress, scoring_progress
 from torchrl_caiac.influence.thresholds import (
     ThresholdSuggestions,
     suggest_thresholds,
@@ -41,6 +42,7 @@ __all__ = [
     "MotionInfluence",
     "ResidualInfluence",
     "ScoreOnWrite",
+    "ScoringProgress",
     "SimulatorInfluence",
     "ThresholdSuggestions",
     "TrueInfluence",
@@ -53,6 +55,7 @@ __all__ = [
     "roc_auc",
     "score_buffer",
     "score_file",
+    "scoring_progress",
     "suggest_thresholds",
     "true_influence",
 ]

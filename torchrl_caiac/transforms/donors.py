@@ -16,7 +16,12 @@ from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
-from torchrl_caiac.transforms.draws import DonorBits, SwapDraw, draw_buffer_donors
+from torchrl_caiac.transforms.draws import (
+    DonorBits,
+    DonorIndex,
+    SwapDraw,
+    draw_buffer_donors,
+)
 from torchrl_caiac.transforms.indexing import plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.lookahead import Lookahead, hold_entities
@@ -30,6 +35,8 @@ __all__ = ["BufferDonors", "eligible_starts", "scan_donors"]
 
 # Rows of the storage that are read together while an index is built.
 _CHUNK = 1 << 17
+# The most rows of an index as numbers: 128 MiB.
+_MOST_LISTED = 1 << 25
 
 
 def scan_donors(
@@ -82,12 +89,13 @@ def eligible_starts(
     *,
     window: int = 1,
     trajectories: TrajectoryIndex | None = None,
-) -> DonorBits:
+) -> DonorIndex | DonorBits:
     """Finds the rows at which windows start in which an entity is uninfluenced.
 
     All rows of such a window belong to one trajectory and have scores of at most
     ``threshold``; a row without a score (NaN) is never part of one. The index takes
-    0.375 bytes for each pair of row and entity.
+    4 bytes for each pair of row and entity that is eligible, at most 128 MiB. One that
+    would be larger takes 0.375 bytes for each pair, and more time to draw from.
 
     Args:
         scores (torch.Tensor): ``[T, N]``, NaN where a row was not scored.
@@ -100,7 +108,7 @@ def eligible_starts(
         trajectories (TrajectoryIndex, optional): needed for windows of several rows.
 
     Returns:
-        DonorBits: the rows of every entity.
+        DonorIndex or DonorBits: the rows of every entity.
 
     Raises:
         ValueError: a score is infinite.
@@ -110,7 +118,7 @@ def eligible_starts(
         >>> from torchrl_caiac.transforms.donors import eligible_starts
         >>> scores = torch.tensor([[0.0], [0.2], [float("nan")], [0.01]])
         >>> eligible_starts(scores, 0.05, torch.tensor([True])).starts
-        tensor([0, 3])
+        tensor([0, 3], dtype=torch.int32)
     """
     length, entities = scores.shape
     device = scores.device
@@ -139,7 +147,8 @@ def eligible_starts(
                 )
             else:
                 words[entity].index_add_(0, word, value)
-    return DonorBits.of_words(words)
+    found = DonorBits.of_words(words)
+    return found if int(found.size.sum()) > _MOST_LISTED else found.listed()
 
 
 class BufferDonors:

@@ -106,10 +106,24 @@ class DonorBits(NamedTuple):
         size = torch.cat([offset, total.view(1)]).diff()
         return cls(words.reshape(-1), before, offset, size)
 
-    @property
-    def starts(self) -> torch.Tensor:
-        """All rows, as in :class:`DonorIndex`: one number for each."""
-        return self.rows(torch.arange(int(self.size.sum()), device=self.words.device))
+    def listed(self) -> DonorIndex:
+        """Returns the rows as numbers, 4 bytes for each, which are faster to look up."""
+        width = len(self.words) // len(self.size)
+        dtype = torch.int32 if 16 * width < 1 << 31 else torch.int64
+        # At least one row, so that an index without any can be read.
+        total = max(1, int(self.size.sum()))
+        starts = torch.zeros(total, dtype=dtype, device=self.words.device)
+        counts, bits = _word_tables(self.words.device)
+        end = 0
+        for start in range(0, len(self.words), _WORDS):
+            word = self.words[start : start + _WORDS].int() & 0xFFFF
+            first = torch.arange(start, start + len(word), device=word.device)
+            first = first % width * 16
+            is_set = torch.arange(16, device=word.device) < counts[word][:, None]
+            rows = (first[:, None] + bits[word])[is_set]
+            starts[end : end + len(rows)] = rows.to(dtype)
+            end += len(rows)
+        return DonorIndex(starts, self.offset, self.size)
 
     def rows(self, place: torch.Tensor) -> torch.Tensor:
         """Returns the rows at places among all rows, int64 ``[*]``."""
