@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 from tqdm.auto import tqdm
 
-from torchrl_caiac._checks import check_int
+from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._files import claim_folder
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import (
@@ -215,6 +215,7 @@ def score_buffer(
     check_int("smoothing", smoothing, 1)
     check_int("lookahead", lookahead, 0)
     check_int("every", every, 1)
+    check_local("rb", rb)
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     key, storage = as_key(key), rb.storage

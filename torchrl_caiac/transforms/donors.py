@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from torchrl_caiac._checks import check_local
 from torchrl_caiac._fingerprints import fingerprint_key, matches
 from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
@@ -174,6 +175,7 @@ class BufferDonors:
         goals: WindowGoal | None = None,
         lookahead: Lookahead | None = None,
     ) -> None:
+        check_local("donors", donors)
         if not isinstance(donors, (ReplayBuffer, TensorStorage)):
             raise TypeError(
                 "donors must be a ReplayBuffer (or its storage), or None to draw from "
