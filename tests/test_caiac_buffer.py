@@ -108,7 +108,12 @@ def cluster() -> Iterator[None]:
         object_store_memory=200 << 20,
         log_to_driver=False,
         configure_logging=False,
-        runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}},
+        runtime_env={
+            "env_vars": {
+                "OMP_NUM_THREADS": "1",
+                "PYTHONPATH": str(Path(__file__).parents[1]),
+            }
+        },
     )
     yield
     ray.shutdown()

@@ -39,6 +39,7 @@ __all__ = [
     "reduce_loss",
     "sampled_rows",
     "sampling_buffer",
+    "set_memmap_entry",
     "storage_data",
     "storage_revision",
     "storage_rows",
@@ -361,6 +362,18 @@ def drop_memmap_leaf(td: TensorDictBase, key: NestedKey) -> None:
     parents, name = ((), key) if isinstance(key, str) else (key[:-1], key[-1])
     node = td.get(parents) if parents else td
     node._tensordict.pop(name)
+    td._erase_cache()
+    node._erase_cache()
+
+
+def set_memmap_entry(td: TensorDictBase, key: NestedKey, entry: Any) -> None:
+    """Sets an entry that the folder of a memory-mapped tensordict has already.
+
+    ``set`` needs an unlocked tensordict, see :func:`drop_memmap_leaf`.
+    """
+    parents, name = ((), key) if isinstance(key, str) else (key[:-1], key[-1])
+    node = td.get(parents) if parents else td
+    node._tensordict[name] = entry
     td._erase_cache()
     node._erase_cache()
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import MemoryMappedTensor, TensorDictBase
+from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import reserve, safe_meta, write_json
+from torchrl_caiac._files import recover_meta, reserve, safe_meta, write_json
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac._torchrl import (
@@ -20,10 +20,11 @@ from torchrl_caiac._torchrl import (
     file_name,
     mark_memmap,
     memmap_folder,
+    set_memmap_entry,
 )
 from torchrl_caiac.data.write_transitions import check_entries, check_key_names
 
-__all__ = ["add_leaf", "new_leaf", "remove_leaf", "store_leaves"]
+__all__ = ["add_leaf", "new_leaf", "open_leaf", "remove_leaf", "store_leaves"]
 
 _logger = logging.getLogger("torchrl_caiac.data.add_leaf")
 
@@ -243,6 +244,50 @@ def new_leaf(
                 remove_leaf(data, key)
                 raise
     return leaf
+
+
+def open_leaf(data: TensorDictBase, key: NestedKey) -> bool:
+    """Opens a leaf that another process has added to the folder of opened data.
+
+    A leaf that is open already is opened again, as its file may be another.
+
+    Args:
+        data (TensorDictBase): memory-mapped data with a folder.
+        key (NestedKey): the leaf.
+
+    Returns:
+        bool: whether the folder has the leaf.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data import add_leaf, load_transitions
+        >>> from torchrl_caiac.data.add_leaf import open_leaf
+        >>> rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = rows.memmap(folder)
+        ...     data = load_transitions(folder, keys=["action"])
+        ...     other = load_transitions(folder, keys=["action"])
+        ...     _ = add_leaf(other, ("info", "weight"), torch.ones(3))
+        ...     open_leaf(data, ("info", "weight")), data["info", "weight"]
+        (True, MemoryMappedTensor([1., 1., 1.]))
+    """
+    folder = memmap_folder(data)
+    if folder is None:
+        return False
+    recover_meta(folder)
+    fresh = TensorDict.load_memmap(folder, allow_pickle=False)
+    if not isinstance(fresh.get(key, None), torch.Tensor):
+        return False
+    mark_memmap(fresh)
+    parts = path_of(key)
+    for depth in range(1, len(parts) + 1):
+        place: NestedKey = parts[:depth] if depth > 1 else parts[0]
+        if depth == len(parts) or not isinstance(data.get(place, None), TensorDictBase):
+            set_memmap_entry(data, place, fresh.get(place))
+            break
+    return True
 
 
 def remove_leaf(data: TensorDictBase, key: NestedKey) -> None:

@@ -19,6 +19,7 @@ from torchrl_caiac.influence.mixture_divergence import causal_action_influence
 from torchrl_caiac.influence.motion import MotionInfluence
 from torchrl_caiac.influence.residual import ResidualInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
+from torchrl_caiac.influence.score_buffer_ray import score_buffer_ray
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
 from torchrl_caiac.influence.thresholds import (
@@ -52,6 +53,7 @@ __all__ = [
     "oracle_score",
     "roc_auc",
     "score_buffer",
+    "score_buffer_ray",
     "score_file",
     "suggest_thresholds",
     "true_influence",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data import ReplayBuffer
 from tqdm.auto import tqdm
 
 from torchrl_caiac._checks import check_int, check_local
@@ -20,41 +19,35 @@ from torchrl_caiac._torchrl import (
     add_revision,
     drop_prefetched,
     forget_leaves,
-    memmap_folder,
     storage_data,
     storage_rows,
 )
 from torchrl_caiac.check import check_before_use
 from torchrl_caiac.data.add_leaf import store_leaves
-from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.estimator_digest import estimator_digest
-from torchrl_caiac.influence.score_leaf import (
-    RowStates,
-    ScoreLeaves,
-    check_shape,
-    find_leaves,
-    new_leaves,
-    row_states,
+from torchrl_caiac.influence.score_leaf import find_leaves, new_leaves
+from torchrl_caiac.influence.score_parts import refuse_members
+from torchrl_caiac.influence.score_pass import (
+    ScorePass,
+    chunk_scores,
+    existing_scores,
+    forget_rows,
+    rows_to_score,
+    stale_and_moved,
+    steps_to_next,
+    write_rows,
 )
-from torchrl_caiac.influence.score_record import (
-    read_record,
-    score_settings,
-    settings_digest,
-    settings_that_differ,
-    write_record,
-)
+from torchrl_caiac.influence.score_record import score_settings, settings_digest
 from torchrl_caiac.influence.score_spread import warn_of_one_side
 from torchrl_caiac.influence.scorer import Scorer, layout_of
-from torchrl_caiac.trajectories import STEPS_KEY, TrajectoryIndex, trajectory_index
+from torchrl_caiac.influence.shards import check_shard, score_shard, settle_parts
+from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = ["score_buffer"]
 
 _logger = logging.getLogger("torchrl_caiac.influence.score_buffer")
 # Passes over a buffer that others write to, before rows are left unscored.
 _MOST_PASSES = 10
-# The score of a row whose transition passes through states that are not stored: it
-# counts as influenced.
-_UNKNOWN = 1e30
 
 
 @torch.no_grad()
@@ -72,6 +65,7 @@ def score_buffer(
     overwrite: bool = False,
     check: bool = True,
     progress: bool = True,
+    shard: tuple[int, int] | None = None,
 ) -> None:
     r"""Computes the influence scores of all stored states and adds them to the storage.
 
@@ -129,8 +123,9 @@ def score_buffer(
     needs a ``__repr__`` (a module: an ``extra_repr``) that names its settings: then
     other attributes than models and tensors are left out.
 
-    One process at a time may score a folder. Open data in a folder with
-    :func:`torchrl_caiac.data.load_transitions`, which detects truncated files.
+    One process at a time may score a folder, or several together, with ``shard``. Open
+    data in a folder with :func:`torchrl_caiac.data.load_transitions`, which detects
+    truncated files.
 
     A warning names entities of which all scores lie on one side of the default
     threshold of :class:`~torchrl_caiac.CAIACTransform`, so that they would be swapped
@@ -169,6 +164,16 @@ def score_buffer(
         check (bool): check a sample of the data first, see
             :func:`~torchrl_caiac.check_dataset`. Defaults to ``True``.
         progress (bool): show a progress bar. Defaults to ``True``.
+        shard (tuple of int, optional): ``(i, n)``, if ``n`` processes, on one machine
+            or several, score a folder together, of which this one is number ``i``,
+            counted from 0. Each makes the same call but for ``i``. They divide the rows
+            among themselves, and take over those of a process that has ended, so that
+            ``n`` may differ from the number that are at work. The call returns when all
+            rows are scored, and the scores are those that one process would have
+            written, to the bit on processors of one kind. Rows that are written
+            meanwhile are left to the next call. With ``overwrite=True``, only scores of
+            other settings are replaced. Defaults to ``None``: this process scores all
+            rows alone.
 
     Raises:
         TypeError: ``rb`` is not a replay buffer, its storage contains no tensordict, or
@@ -176,8 +181,10 @@ def score_buffer(
         ValueError: the buffer is empty; an observation or a score is not finite; the
             estimator's output has another shape; the leaf or the score file has another
             origin, or the scores have other settings; ``every`` is above 1 and old rows
-            were overwritten; ``lookahead`` is below the steps to the next states.
-        RuntimeError: another process is scoring the folder.
+            were overwritten; ``lookahead`` is below the steps to the next states;
+            ``shard`` is not ``(i, n)`` with ``0 <= i < n``, the storage has no folder,
+            or the processes that score it together have different settings.
+        RuntimeError: another process is scoring the folder, and not by parts.
         DatasetError: the check found errors.
         KeyError: the storage lacks a key.
 
@@ -215,6 +222,8 @@ def score_buffer(
     check_int("smoothing", smoothing, 1)
     check_int("lookahead", lookahead, 0)
     check_int("every", every, 1)
+    if shard is not None:
+        check_shard(shard)
     check_local("rb", rb)
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
@@ -251,7 +260,7 @@ def score_buffer(
                 "every=1"
             )
         data = storage_rows(storage)
-        steps = _steps(data, index.length, lookahead)
+        steps = steps_to_next(data, index.length, lookahead)
         scorer = Scorer(
             data,
             estimator,
@@ -264,18 +273,14 @@ def score_buffer(
             settings=settings_digest(settings),
             is_prepared=is_prepared,
         )
-        is_done = _one_pass(
-            storage,
-            data,
-            index,
-            scorer,
-            layout,
-            key,
-            settings,
-            steps,
-            overwrite=overwrite and not number,
-            progress=progress,
-        )
+        own = ScorePass(storage, data, index, scorer, layout, key, settings, steps)
+        if shard is not None:
+            # The process that joins the scores also looks at them.
+            number = int(
+                score_shard(own, shard, overwrite=overwrite, progress=progress)
+            )
+            break
+        is_done = _one_pass(own, overwrite=overwrite and not number, progress=progress)
         if is_done:
             break
         is_prepared = scorer.is_prepared
@@ -292,24 +297,13 @@ def score_buffer(
         warn_of_one_side(leaves.scores[: len(storage)], layout)
 
 
-def _one_pass(
-    storage: TensorStorage,
-    data: TensorDictBase,
-    index: TrajectoryIndex,
-    scorer: Scorer,
-    layout: EntityLayout,
-    key: NestedKey,
-    settings: dict[str, Any],
-    steps: torch.Tensor | None,
-    *,
-    overwrite: bool,
-    progress: bool,
-) -> bool:
+def _one_pass(own: ScorePass, *, overwrite: bool, progress: bool) -> bool:
     """Scores all rows without a valid score; returns whether there were none."""
-    before = None if overwrite else read_record(storage, data, key)
-    found = None
-    if not overwrite:
-        found = _existing(storage, data, scorer, index.length, layout, key, settings)
+    index, scorer = own.index, own.scorer
+    with _claimed(own):
+        settle_parts(own, overwrite=overwrite)
+    before = None if overwrite else own.read_record()
+    found = None if overwrite else existing_scores(own)
     if found is None:
         # Score the first block before anything is written: an estimator or data that
         # do not fit leave the storage unchanged.
@@ -321,193 +315,39 @@ def _one_pass(
         if bool((states.valid & ~states.moved).all()):
             return True
         scorer.feature_shape = feature_shape = tuple(leaves.scores.shape[1:])
-        position = torch.arange(index.length, device=index.device)
-        rows = index.rows(position).cpu()
-        stale, moved = ~states.valid[rows], states.moved[rows]
-    with _claimed(data):
-        if not overwrite and read_record(storage, data, key) != before:
+        stale, moved = stale_and_moved(own, states)
+    with _claimed(own):
+        if not overwrite and own.read_record() != before:
             return False  # another process has scored: look again in the next pass
         if found is None:
-            write_record(storage, data, key, settings, layout, "new")
-            leaves = new_leaves(storage, key, feature_shape)
-        write_record(storage, data, key, settings, layout, "scoring")
-        _score(
-            scorer,
-            index,
-            leaves,
-            stale,
-            moved,
-            steps,
-            is_first=is_first,
-            progress=progress,
-        )
-        write_record(storage, data, key, settings, layout, "scored")
-    add_revision(storage)
+            own.write_record("new")
+            leaves = new_leaves(own.storage, own.key, feature_shape)
+        own.write_record("scoring")
+        todo = rows_to_score(own, stale, moved, is_first=is_first)
+        forget_rows(own, leaves, todo)
+        left = sum(int(is_near.sum()) for _, is_near in todo)
+        with tqdm(
+            total=index.length,
+            initial=index.length - left,
+            desc="scoring",
+            unit="row",
+            disable=not progress or not todo,
+        ) as bar:
+            for c, is_near in todo:
+                rows, scores, fingerprints = chunk_scores(own, c, is_near)
+                write_rows(leaves, rows, scores, fingerprints)
+                bar.update(len(rows))
+        own.write_record("scored")
+    add_revision(own.storage)
     return False
 
 
-def _existing(
-    storage: TensorStorage,
-    data: TensorDictBase,
-    scorer: Scorer,
-    length: int,
-    layout: EntityLayout,
-    key: NestedKey,
-    settings: dict[str, Any],
-) -> tuple[ScoreLeaves, RowStates, bool] | None:
-    """Returns leaves to keep, the states of rows, and whether a pass was interrupted.
-
-    Raises:
-        ValueError: the scores are of another origin or have other settings.
-    """
-    leaves = find_leaves(storage, key)
-    record = read_record(storage, data, key)
-    if record is not None and record["state"] == "new":
-        return None  # interrupted before the leaves were initialized
-    if leaves is None:
-        folder = memmap_folder(data) if data.is_memmap() else None
-        if folder is not None and record is not None:
-            raise ValueError(
-                f"scores in {key!r} were added to {folder} after these data were "
-                "opened: open them again with load_transitions, call "
-                "score_buffer(..., overwrite=True) to replace them, or give another "
-                "key"
-            )
-        return None
-    check_shape(leaves, key, layout)
-    # Leaves without scores may have been created with the first write to the buffer.
-    if leaves.fingerprints is None:
-        if leaves.all_nan(length):
-            return None
-        raise ValueError(
-            f"the storage has scores in {key!r} without fingerprints of their states "
-            "(by another program, or an earlier version): call "
-            "score_buffer(..., overwrite=True) to replace them, or give another key"
-        )
-    digest = settings_digest(settings)
-    states = row_states(data, leaves, layout, length, digest, scorer.surroundings)
-    has_others = states.has_others
-    if record is not None and record.get("entities") != list(layout.names):
-        has_others = True  # whose fingerprints are not those of these entities
-    if has_others:
-        differences = "see the settings of the earlier call"
-        if record is not None:
-            differences = settings_that_differ(record["settings"], settings)
-        raise ValueError(
-            f"the scores in {key!r} have other settings: {differences}. Call "
-            "score_buffer(..., overwrite=True) to recompute them, or give another key"
-        )
-    return leaves, states, record is not None and record["state"] == "scoring"
-
-
-def _score(
-    scorer: Scorer,
-    index: TrajectoryIndex,
-    leaves: ScoreLeaves,
-    stale: torch.Tensor,
-    moved: torch.Tensor,
-    steps: torch.Tensor | None,
-    *,
-    is_first: bool,
-    progress: bool,
-) -> None:
-    """Scores stale rows, and the rows whose scores depend on them.
-
-    Args:
-        scorer (Scorer): computes the scores.
-        index (TrajectoryIndex): the trajectories.
-        leaves (ScoreLeaves): where they are written.
-        stale (torch.Tensor): bool ``[T]`` by position.
-        moved (torch.Tensor): bool ``[T]`` by position, rows that are scored too, but on
-            which no others depend.
-        steps (torch.Tensor, optional): ``[T]``, the steps to the next states.
-
-    Keyword Args:
-        is_first (bool): whether chunks are scored as a whole, so that an interrupted
-            first pass ends with the same bytes as an uninterrupted one.
-        progress (bool): show a progress bar.
-    """
-    scores, known = leaves
-    assert known is not None
-    before, after = scorer.reach
-    # In a ring, the oldest row has lost the row before it to the newest one.
-    is_ring = index.order is None and index.length == len(scores)
-    todo = []
-    left = 0
-    for c in range(scorer.num_chunks):
-        span = scorer.span(c)
-        near = torch.arange(span.start - before, span.stop + after)
-        near = near % index.length if is_ring else near.clamp(0, index.length - 1)
-        # Whether there is a stale row around each one.
-        counts = stale[near].long().cumsum(0)
-        counts = torch.cat([counts.new_zeros(1), counts])
-        size = before + after + 1
-        is_near = (counts[size:] > counts[:-size]) | moved[span]
-        if not bool(is_near.any()):
-            continue
-        if is_first:
-            is_near[:] = True
-        rows = scorer.rows(c)[is_near]
-        # A row whose neighbors changed counts as unscored, so that it is found again
-        # if this call is interrupted.
-        known[rows.to(known.device)] = 0
-        todo.append((c, is_near))
-        left += len(rows)
-    with tqdm(
-        total=index.length,
-        initial=index.length - left,
-        desc="scoring",
-        unit="row",
-        disable=not progress or not todo,
-    ) as bar:
-        for c, is_near in todo:
-            rows = scorer.rows(c)[is_near]
-            if bool(is_near.all()):
-                found, fingerprints = scorer.chunk(c)
-            else:
-                chosen = is_near.nonzero()[:, 0] + scorer.span(c).start
-                found, fingerprints = scorer.some(chosen)
-            if steps is not None:
-                found[_is_cut(index, rows, steps)] = _UNKNOWN
-            rows = rows.to(scores.device)
-            # The fingerprints last: without them the scores do not count.
-            scores[rows] = found.to(scores.device)
-            known[rows] = fingerprints.to(known.device)
-            bar.update(len(rows))
-
-
-def _steps(data: TensorDictBase, length: int, lookahead: int) -> torch.Tensor | None:
-    """Returns the steps from states to next states, ``[T]``, where they are stored.
-
-    Raises:
-        ValueError: they are more than the lookahead.
-    """
-    leaf = data.get(STEPS_KEY, None)
-    if leaf is None:
-        return None
-    steps = leaf.as_subclass(torch.Tensor)[:length].reshape(length)
-    most = int(steps.max())
-    if most > lookahead:
-        raise ValueError(
-            f"the next states are up to {most} steps later, see {STEPS_KEY!r}, but "
-            f"lookahead is {lookahead}: an entity that is influenced in between would "
-            f"count as uninfluenced. Use lookahead={most} or more"
-        )
-    return steps
-
-
-def _is_cut(
-    index: TrajectoryIndex, rows: torch.Tensor, steps: torch.Tensor
-) -> torch.Tensor:
-    """Returns the rows for which a state up to the next one is not stored."""
-    left = index.remaining(rows)
-    end = index.later(rows.to(index.device), left)
-    # The last row has one more state, if that is the one right after it.
-    known = left + (steps[end.to(steps.device)] == 1).to(left.device)
-    return (steps[rows.to(steps.device)].to(left.device) > known).cpu()
-
-
-def _claimed(data: TensorDictBase) -> AbstractContextManager[None]:
-    """Locks the folder of memory-mapped data, so that one process scores it."""
-    folder = memmap_folder(data) if data.is_memmap() else None
-    return nullcontext() if folder is None else claim_folder(folder)
+@contextmanager
+def _claimed(own: ScorePass) -> Iterator[None]:
+    """Locks the folder of memory-mapped data, so that this process scores it alone."""
+    if own.folder is None:
+        yield
+        return
+    with claim_folder(own.folder):
+        refuse_members(own.folder)
+        yield

@@ -63,6 +63,7 @@ class Scorer:
         is_prepared (bool): whether the estimator was prepared. Defaults to ``False``.
 
     Attributes:
+        batch_size (int): rows in a block.
         num_chunks (int): the number of chunks.
         feature_shape (tuple of int, optional): the shape of the scores of a row,
             ``None`` until it is known.
@@ -103,7 +104,7 @@ class Scorer:
         self._estimator = estimator
         self._layout = layout
         self._index = index
-        self._batch_size = batch_size
+        self.batch_size = batch_size
         self._past = smoothing // 2
         self._future = (smoothing - 1) // 2
         self._lookahead = lookahead
@@ -115,8 +116,8 @@ class Scorer:
 
     def span(self, c: int) -> slice:
         """Returns the positions of chunk ``c``."""
-        start = c * self._batch_size
-        return slice(start, min(start + self._batch_size, self._index.length))
+        start = c * self.batch_size
+        return slice(start, min(start + self.batch_size, self._index.length))
 
     def rows(self, c: int) -> torch.Tensor:
         """Returns the rows of chunk ``c``, int64 ``[n]``."""
@@ -155,11 +156,11 @@ class Scorer:
         """
         span = self.span(c)
         start, stop = self._around(span.start, span.stop)
-        needed = range(start // self._batch_size, -(-stop // self._batch_size))
+        needed = range(start // self.batch_size, -(-stop // self.batch_size))
         # Keep no more blocks than one chunk reaches.
         self._blocks = {b: v for b, v in self._blocks.items() if b in needed}
         parts = [self.block(b) for b in needed]
-        first = start - needed[0] * self._batch_size
+        first = start - needed[0] * self.batch_size
         whole = _Block(
             *(
                 torch.cat(leaves)[first : first + stop - start]
