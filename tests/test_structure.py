@@ -47,6 +47,7 @@ LAYERS = [
     {"fit"},
     {"influence"},
     {"transforms"},
+    {"caiac_buffer"},
     {"evaluation"},
     {"plotting"},
     {"augment", "inspection", "report", "scored"},

@@ -27,6 +27,7 @@ __all__ = [
     "drop_prefetched",
     "file_name",
     "forget_leaves",
+    "is_in_another_process",
     "is_in_order_of_time",
     "last_written",
     "linear_pointwise",
@@ -46,6 +47,42 @@ __all__ = [
     "vmap_loss",
     "writes_paused",
 ]
+
+
+# --- buffers of other processes ------------------------------------------------------
+
+
+def is_in_another_process(source: Any) -> bool:
+    """Returns whether a replay buffer only forwards calls to another process.
+
+    Args:
+        source (Any): a :class:`~torchrl.data.RayReplayBuffer`, one of its clients, or
+            anything else.
+
+    Returns:
+        bool: true for these, and for a reference of :mod:`torch.distributed.rpc`.
+
+    Examples:
+        >>> from torchrl.data import ReplayBuffer
+        >>> from torchrl_caiac._torchrl import is_in_another_process
+        >>> is_in_another_process(ReplayBuffer())
+        False
+    """
+    if isinstance(source, ReplayBuffer):
+        # Of the class, since a subclass may forward every attribute.
+        return any(_forwards(kind) for kind in type(source).__mro__)
+    kinds = type(source).__mro__
+    return any(
+        _forwards(kind)
+        or (kind.__module__, kind.__name__) == ("ray.actor", "ActorHandle")
+        or kind.__name__ in ("RRef", "PyRRef")
+        for kind in kinds
+    )
+
+
+def _forwards(kind: type) -> bool:
+    # By its name, because importing the module starts to look for ray.
+    return kind.__module__ == "torchrl.data.replay_buffers.ray_buffer"
 
 
 # --- storages of replay buffers ------------------------------------------------------

@@ -15,7 +15,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Bounded, ReplayBuffer
 from tqdm.auto import tqdm
 
-from torchrl_caiac._checks import check_int
+from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._fit_quality import log_quality
 from torchrl_caiac._fit_rows import FitRows, split_rows, trajectory_numbers
 from torchrl_caiac._keys import as_key, jsonable
@@ -157,6 +157,7 @@ def fit_world_model(
         raise ValueError(
             f"validation_fraction must be between 0 and 1, got {validation_fraction!r}"
         )
+    check_local("data", data)
     if isinstance(data, ReplayBuffer):  # whose samples never end
         raise TypeError(
             f"data is a {type(data).__name__}, expected transitions: pass rb.storage[:]"

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
-from torchrl_caiac._checks import check_int
+from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._layout_units import position_features
 from torchrl_caiac._torchrl import storage_rows
 from torchrl_caiac.entities import EntityLayout
@@ -208,6 +208,7 @@ def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDic
         tensor([0, 4, 8])
     """
     check_int("max_rows", max_rows, 1)
+    check_local("data", data)
     if isinstance(data, ReplayBuffer):
         storage = data.storage
         data = storage_rows(storage)[: len(storage)]

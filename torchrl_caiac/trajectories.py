@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from torchrl_caiac._checks import check_local
 from torchrl_caiac._keys import missing_key, path
 from torchrl_caiac._torchrl import (
     is_in_order_of_time,
@@ -182,6 +183,7 @@ def trajectory_index(
         (tensor([2, 1, 1]), tensor([2, 3, 4]))
     """
     newest, streams = None, 1
+    check_local("source", source)
     if isinstance(source, TensorDictBase):
         if source.batch_dims != 1:
             raise ValueError(

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 
-from torchrl_caiac._checks import check_int
+from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import last_written, storage_rows
 from torchrl_caiac.check.columns import check_columns, check_goals, unowned_columns
@@ -427,6 +427,7 @@ def _key(key: NestedKey | None) -> NestedKey | None:
 
 def _rows(data: TensorDictBase | ReplayBuffer) -> tuple[TensorDictBase, torch.Tensor]:
     """Returns the transitions ``[T]``, and the rows that were written last."""
+    check_local("data", data)
     newest = None
     if isinstance(data, ReplayBuffer):
         storage = data.storage

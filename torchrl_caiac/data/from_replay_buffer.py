@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from torchrl_caiac._checks import check_local
 from torchrl_caiac._keys import as_key, leaf_names, missing_key
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac._torchrl import storage_rows
@@ -197,6 +198,7 @@ def _storage(source: Any) -> Any:
 def _rows(source: Any) -> TensorDictBase:
     if isinstance(source, TensorDictBase):
         return source
+    check_local("source", source)
     if not isinstance(source, (ReplayBuffer, TensorStorage)):
         raise TypeError(
             f"the source is a {type(source).__name__}, expected a replay buffer, its "

@@ -10,7 +10,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_caiac.data.add_leaf import store_leaves
 
-__all__ = ["offline_buffer"]
+__all__ = ["offline_buffer", "offline_storage"]
 
 
 def offline_buffer(
@@ -50,6 +50,37 @@ def offline_buffer(
         >>> offline_buffer(rows, 4).sample()["action"].shape
         torch.Size([4, 2])
     """
+    arguments: dict[str, Any] = {
+        "storage": offline_storage(data),
+        "writer": ImmutableDatasetWriter(),
+        "batch_size": batch_size,
+        **kwargs,
+    }
+    if sampler is not None:
+        arguments["sampler"] = sampler
+    return TensorDictReplayBuffer(**arguments)
+
+
+def offline_storage(data: TensorDictBase) -> TensorStorage:
+    """Creates the storage of :func:`offline_buffer`, without copying the data.
+
+    Args:
+        data (TensorDictBase): the transitions, ``[T]``.
+
+    Returns:
+        TensorStorage: a storage of them.
+
+    Raises:
+        TypeError: ``data`` is not a tensordict.
+        ValueError: ``data`` has no rows or several batch dimensions.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.offline_buffer import offline_storage
+        >>> len(offline_storage(TensorDict({"action": torch.zeros(10, 2)}, [10])))
+        10
+    """
     if not isinstance(data, TensorDictBase):
         raise TypeError(f"data must be a tensordict, got {type(data).__name__}")
     if data.batch_dims != 1 or not len(data):
@@ -60,12 +91,4 @@ def offline_buffer(
     store_leaves(data)
     # Sample on the device of the data, to avoid transfers.
     device = data.device or next(iter(data.values(True, True))).device
-    arguments: dict[str, Any] = {
-        "storage": TensorStorage(data, device=device),
-        "writer": ImmutableDatasetWriter(),
-        "batch_size": batch_size,
-        **kwargs,
-    }
-    if sampler is not None:
-        arguments["sampler"] = sampler
-    return TensorDictReplayBuffer(**arguments)
+    return TensorStorage(data, device=device)

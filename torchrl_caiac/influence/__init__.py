@@ -19,6 +19,7 @@ from torchrl_caiac.influence.mixture_divergence import causal_action_influence
 from torchrl_caiac.influence.motion import MotionInfluence
 from torchrl_caiac.influence.residual import ResidualInfluence
 from torchrl_caiac.influence.score_buffer import score_buffer
+from torchrl_caiac.influence.score_buffer_ray import score_buffer_ray
 from torchrl_caiac.influence.score_on_write import ScoreOnWrite
 from torchrl_caiac.influence.score_record import score_file
 from torchrl_caiac.influence.shards import ScoringProgress, scoring_progress
@@ -54,6 +55,7 @@ __all__ = [
     "oracle_score",
     "roc_auc",
     "score_buffer",
+    "score_buffer_ray",
     "score_file",
     "scoring_progress",
     "suggest_thresholds",

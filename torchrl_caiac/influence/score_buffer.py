@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 from tqdm.auto import tqdm
 
-from torchrl_caiac._checks import check_int
+from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._files import claim_folder
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import (
@@ -224,6 +224,7 @@ def score_buffer(
     check_int("every", every, 1)
     if shard is not None:
         check_shard(shard)
+    check_local("rb", rb)
     if not isinstance(rb, ReplayBuffer):
         raise TypeError(f"score_buffer scores a ReplayBuffer, got {type(rb).__name__}")
     key, storage = as_key(key), rb.storage

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
-from torchrl_caiac._checks import check_int
+from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._fingerprints import fingerprint_key, matches
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._torchrl import storage_rows
@@ -364,6 +364,7 @@ def _motion(
 
 
 def _layout(source: Any, layout: EntityLayout | None) -> EntityLayout:
+    check_local("source", source)
     if layout is None and isinstance(source, ReplayBuffer):
         found = (getattr(transform, "layout", None) for transform in source.transform)
         layout = next((x for x in found if isinstance(x, EntityLayout)), None)

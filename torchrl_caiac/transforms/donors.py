@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer, TensorStorage
 
+from torchrl_caiac._checks import check_local
 from torchrl_caiac._fingerprints import fingerprint_key, matches
 from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
@@ -190,6 +191,7 @@ class BufferDonors:
         goals: WindowGoal | None = None,
         lookahead: Lookahead | None = None,
     ) -> None:
+        check_local("donors", donors)
         if not isinstance(donors, (ReplayBuffer, TensorStorage)):
             raise TypeError(
                 "donors must be a ReplayBuffer (or its storage), or None to draw from "

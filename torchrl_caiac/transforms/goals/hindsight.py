@@ -374,7 +374,8 @@ class HindsightGoal(FutureGoal):
                     "no future goals were drawn for this batch: pass the same "
                     "HindsightGoal as sample_unit=... of the replay buffer, and get "
                     "data by rb.sample(); or give future=0, where goals of the batch "
-                    "are enough"
+                    "are enough. For a buffer in another process, create a "
+                    "CAIACReplayBuffer there, since both would be sent apart"
                 )
             for goal in goals.values():
                 if goal.shape[0] != rows:
