@@ -1,9 +1,9 @@
 """Trains offline, then collects, scores and trains in turn.
 
-``python online.py`` trains ``learner=td3_bc`` on the offline data of Fetch-Push, with
-and without counterfactuals. Then, in each round, TorchRL's collectors play episodes with
-the policy and some noise, the method scores them, and training goes on with batches that
-mix offline and online transitions. ``online.episodes=0`` collects nothing, for
+``python online.py`` trains ``learner=td3_bc`` on data of Fetch-Push, with
+and without counterfactuals. Then, in each round, collectors play episodes with
+the policy and some noise, the method scores them, and training goes on with batches
+of offline and online transitions. ``online.episodes=0`` collects nothing, for
 comparison. The policies before the first and after the last round play from the test
 starts. ``size=quick`` is a smoke run, with ``online.rounds=2`` and the like.
 
@@ -103,7 +103,9 @@ def online_rows(
     if not path.exists():
         seed = 1000 * (learner_seed(folder) + 1) + number
         write_transitions(
-            collect_episodes(policy, cfg, seed), path, action_bounds=([-1.0] * 4, [1.0] * 4)
+            collect_episodes(policy, cfg, seed),
+            path,
+            action_bounds=([-1.0] * 4, [1.0] * 4),
         )
     parts, first = [], 0
     for i in range(1, number + 1):
@@ -209,7 +211,9 @@ def main(cfg: DictConfig) -> None:
         for method in cfg.method:
             folder = run_folder(cfg, method, seed)
             with start(cfg, folder=folder) as console, console.stage(folder.name):
-                write_results(Path(cfg.publish) / "online.csv", [*run(cfg, method, seed)])
+                write_results(
+                    Path(cfg.publish) / "online.csv", [*run(cfg, method, seed)]
+                )
 
 
 if __name__ == "__main__":
