@@ -43,7 +43,7 @@ LAYERS = [
     {"check"},
     {"objectives"},
     {"_fit_rows"},
-    {"_fit_quality"},
+    {"_fit_quality", "_fit_ranks"},
     {"fit"},
     {"influence"},
     {"transforms"},

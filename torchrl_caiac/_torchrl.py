@@ -17,7 +17,12 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict._utils_key_json import _encode_key_for_filesystem
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import ReplayBuffer, TensorDictMaxValueWriter, TensorStorage
+from torchrl.data import (
+    OfflineToOnlineReplayBuffer,
+    ReplayBuffer,
+    TensorDictMaxValueWriter,
+    TensorStorage,
+)
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import _vmap_func
 
@@ -40,6 +45,7 @@ __all__ = [
     "sampled_rows",
     "sampling_buffer",
     "set_memmap_entry",
+    "set_online_buffer",
     "storage_data",
     "storage_revision",
     "storage_rows",
@@ -326,6 +332,11 @@ def drop_prefetched(rb: ReplayBuffer) -> None:
     """Discards the batches that a buffer has prefetched."""
     with rb._futures_lock:
         rb._clear_prefetch_queue_locked()
+
+
+def set_online_buffer(mixed: OfflineToOnlineReplayBuffer, online: ReplayBuffer) -> None:
+    """Replaces the online buffer, which the constructor makes of a storage only."""
+    mixed._online_buffer = online
 
 
 # --- memory-mapped tensordicts -------------------------------------------------------

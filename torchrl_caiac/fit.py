@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -17,6 +18,7 @@ from tqdm.auto import tqdm
 
 from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._fit_quality import log_quality
+from torchrl_caiac._fit_ranks import Ranks
 from torchrl_caiac._fit_rows import FitRows, split_rows, trajectory_numbers
 from torchrl_caiac._keys import as_key, jsonable
 from torchrl_caiac.check import check_before_use
@@ -49,6 +51,7 @@ def fit_world_model(
     flush_denormal: bool = True,
     progress: bool = True,
     check: bool = True,
+    distributed: bool = False,
 ) -> TensorDict:
     """Fits a world model by maximum likelihood (paper, A.7).
 
@@ -101,6 +104,14 @@ def fit_world_model(
         check (bool): whether to check a sample of the data first, see
             :func:`~torchrl_caiac.check.check_dataset`. Warnings are logged. Defaults
             to ``True``.
+        distributed (bool): whether the processes of the default group of
+            ``torch.distributed`` fit the model together, for example under
+            ``torchrun``. Each calls this function with the same arguments, and draws
+            its own ``batch_size`` transitions in each step; gradients are averaged
+            over the processes, so that all end with the same model. The first process
+            writes the checkpoint, which the others read: it must be in a file system
+            that they share. The result depends on the number of processes. Defaults
+            to ``False``.
 
     Returns:
         TensorDict: one row for each validation, ``[E]``: ``"step"``; ``"train_nll"``,
@@ -116,7 +127,8 @@ def fit_world_model(
             an action is outside of its bounds by more than 1e-4 of their width; bounds
             of several datasets differ; the checkpoint is truncated, or was made with
             other settings or data.
-        RuntimeError: the loss is not finite.
+        RuntimeError: the loss is not finite; with ``distributed``, there is no
+            process group, or the processes have different settings, data or steps.
         DatasetError: the check found errors.
 
     Examples:
@@ -162,6 +174,7 @@ def fit_world_model(
         raise TypeError(
             f"data is a {type(data).__name__}, expected transitions: pass rb.storage[:]"
         )
+    ranks = Ranks(distributed)
     sources = [data] if isinstance(data, TensorDictBase) else list(data)
     bounds = known_bounds(sources, action_spec, model.action_dim)
     rows = FitRows(model, sources, max_memory, bounds)
@@ -177,59 +190,73 @@ def fit_world_model(
     if check:
         _check(model, sources, key)
     fit = _Fit(model, lr, generator)
+    settings: dict[str, Any] = {
+        "model": model.config,
+        "data_rows": rows.lengths,
+        "data_checksum": rows.checksum,
+        "action_bounds": bounds and [bound.tolist() for bound in bounds],
+        "batch_size": batch_size,
+        "lr": lr,
+        "validation_fraction": validation_fraction,
+        "trajectory_key": jsonable(key),
+        "eval_every": eval_every,
+        "max_validation_rows": max_validation_rows,
+        "seed": seed,
+    }
+    if ranks.world > 1:
+        settings["processes"] = ranks.world
     keeper: TrainingCheckpoint | None = None
     if checkpoint is not None:
         keeper = TrainingCheckpoint(
             checkpoint,
-            settings={
-                "model": model.config,
-                "data_rows": rows.lengths,
-                "data_checksum": rows.checksum,
-                "action_bounds": bounds and [bound.tolist() for bound in bounds],
-                "batch_size": batch_size,
-                "lr": lr,
-                "validation_fraction": validation_fraction,
-                "trajectory_key": jsonable(key),
-                "eval_every": eval_every,
-                "max_validation_rows": max_validation_rows,
-                "seed": seed,
-            },
+            settings=settings,
             rng=False,  # the batches have their own generator
             model=model,
             optimizer=fit.optimizer,
             fit=fit,
         )
-        fit.step = keeper.load(max_step=steps)
+        load = functools.partial(keeper.load, max_step=steps)
+        ranks.by_the_first(load)  # it also removes what an interrupted call left
+        fit.step = load()
         if fit.step:
             _LOGGER.info("resuming at step %d of %s", fit.step, keeper.path)
+    # Ranks agree before they wait for each other's gradients.
+    every = {"steps": steps, "checkpoint_every": checkpoint_every}
+    ranks.check_same({**settings, **every, "keeps": keeper is not None}, fit.step)
     if not model.has_floor:
         model.fit_variance_floor(sources)
     if not model.fitted:
         model.fit_statistics(rows.raw_targets(train))
     model.set_action_bounds(low, high)
 
+    ranks.copy_state(model)
     model.train()
     bar = tqdm(
         total=steps,
         initial=fit.step,
-        disable=not progress,
+        disable=not progress or ranks.rank > 0,
         desc="world model",
         unit="step",
     )
     with bar, _flushing_denormals(flush_denormal):
         while fit.step < steps:
-            choice = torch.randint(len(train), (batch_size,), generator=generator)
+            size = batch_size * ranks.world
+            choice = torch.randint(len(train), (size,), generator=generator)
+            choice = choice[ranks.rank :: ranks.world]
             state, action, raw = rows.get(train[choice])
             prediction = model.forward_tensors(state, action)
             loss = model.nll(prediction, model.normalise(raw)).mean()
             fit.optimizer.zero_grad()
             loss.backward()
+            ranks.average_gradients(model)
             fit.optimizer.step()
+            ranks.average_statistics(model)
             fit.step += 1
             fit.train_sum += loss.detach().double()
             fit.train_count += 1
             bar.update()
             if fit.step % eval_every == 0 or fit.step == steps:
+                ranks.average(fit.train_sum)
                 fit.validate(rows, validation)
                 bar.set_postfix(
                     nll=f"{fit.history[-1]['validation_nll']:.3f}",
@@ -238,7 +265,7 @@ def fit_world_model(
             if keeper is not None and (
                 fit.step % checkpoint_every == 0 or fit.step == steps
             ):
-                keeper.save(fit.step)
+                ranks.by_the_first(keeper.save, fit.step)
     model.load_state_dict(fit.best)
     model.eval()
     log_quality(model, fit.history, rows, train, validation)

@@ -101,7 +101,18 @@ class HindsightLearner(GoalConditioned):
 
     def rows(self) -> TensorDictBase:
         """Returns what learning reads, in memory."""
-        return self.read_leaves(self.environment.goal_rows())
+        return self.learning_rows(self.environment.goal_rows())
+
+    def learning_rows(self, stored: TensorDictBase) -> TensorDictBase:
+        """Returns what learning reads of stored transitions, in memory."""
+        return self.read_leaves(stored)
+
+    def make_online_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
+        """Makes the buffer of collected rows, in which no episode may succeed."""
+        share = self.settings.get("successful")
+        if share is not None and not bool(until_success(rows).any()):
+            share = None
+        return self._make_buffer(rows, share)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of transitions, counterfactuals, and hindsight goals.
@@ -111,6 +122,11 @@ class HindsightLearner(GoalConditioned):
         setting ``random_goals: false`` there are none: no action explains them, which
         matters to a learner that repeats actions.
         """
+        return self._make_buffer(rows, self.settings.get("successful"))
+
+    def _make_buffer(
+        self, rows: TensorDictBase, share: float | None
+    ) -> TensorDictReplayBuffer:
         environment = self.environment
         if environment.reward_fn is None:
             raise ValueError(
@@ -129,7 +145,6 @@ class HindsightLearner(GoalConditioned):
             **self.augmentation.get("hindsight", {}),
         )
         options: dict[str, Any] = {}
-        share = self.settings.get("successful")
         if share is not None:
             if not environment.episodes_have_goals:
                 raise ValueError(

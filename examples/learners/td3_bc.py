@@ -22,9 +22,9 @@ class TD3BC(TD3):
     counterfactuals too: a swap leaves out what the action is for.
     """
 
-    def rows(self) -> TensorDictBase:
+    def learning_rows(self, stored: TensorDictBase) -> TensorDictBase:
         """Returns what learning reads, and which actions are not repeated."""
-        rows = super().rows()
+        rows = super().learning_rows(stored)
         cloned = torch.ones(len(rows), dtype=torch.bool)
         # Play reaches no goal of its own, and all of its rows lead to later states.
         if self.environment.episodes_have_goals:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from torchrl_caiac.transforms.donors import eligible_starts
 from torchrl_caiac.transforms.draws import (
+    DonorBits,
     DonorIndex,
     draw_batch_donors,
     draw_buffer_donors,
@@ -132,6 +133,14 @@ def test_buffer_donors_are_uniform() -> None:
     assert draw.swapped.all() and not draw.no_donor.any()
 
 
+def _bits(free: torch.Tensor) -> DonorBits:
+    """Sets the bits of free rows, bool ``[T, N]``, one by one."""
+    words = torch.zeros(free.shape[1], -(-len(free) // 16), dtype=torch.int32)
+    for row, entity in free.nonzero().tolist():
+        words[entity, row // 16] |= 1 << row % 16
+    return DonorBits.of_words(words.to(torch.int16))
+
+
 @settings(deadline=None, max_examples=50)
 @given(
     rows=st.integers(1, 70),
@@ -141,14 +150,14 @@ def test_buffer_donors_are_uniform() -> None:
 def test_bits_draw_what_lists_draw(rows: int, share: float, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     free = torch.rand(rows, 3, generator=generator) < share
-    bits = eligible_starts((~free).float(), 0.5, torch.ones(3, dtype=torch.bool))
+    bits = _bits(free)
     lists = [column.nonzero()[:, 0] for column in free.unbind(1)]
     size = torch.tensor([len(found) for found in lists])
     starts = torch.cat(lists)
     index = DonorIndex(
         starts if len(starts) else torch.zeros(1).long(), size.cumsum(0) - size, size
     )
-    assert bits.starts.tolist() == starts.tolist()
+    assert bits.listed().starts[: len(starts)].tolist() == starts.tolist()
     wanted, found = (
         draw_buffer_donors(
             torch.ones(200, 3, dtype=torch.bool),
@@ -163,7 +172,8 @@ def test_bits_draw_what_lists_draw(rows: int, share: float, seed: int) -> None:
 
 def test_bits_need_less_than_half_a_byte_for_a_row() -> None:
     rows = 200_000
-    bits = eligible_starts(torch.zeros(rows, 1), 0.5, torch.tensor([True]))
+    words = torch.full((1, rows // 16), -1, dtype=torch.int16)  # all bits
+    bits = DonorBits.of_words(words)
     size = sum(leaf.numel() * leaf.element_size() for leaf in bits)
     assert size <= 0.38 * rows
     assert bits.rows(torch.tensor([0, 17, rows - 1])).tolist() == [0, 17, rows - 1]

@@ -18,6 +18,7 @@ from torchrl_caiac.data.load_robomimic import load_robomimic
 from torchrl_caiac.data.load_transitions import load_transitions
 from torchrl_caiac.data.mix_trajectories import mix_trajectories
 from torchrl_caiac.data.offline_buffer import offline_buffer
+from torchrl_caiac.data.offline_to_online import offline_to_online_buffer
 from torchrl_caiac.data.open_dataset import FORMATS, DatasetFormat, open_dataset
 from torchrl_caiac.data.select_successful import select_successful
 from torchrl_caiac.data.to_minari import to_minari
@@ -45,6 +46,7 @@ __all__ = [
     "load_transitions",
     "mix_trajectories",
     "offline_buffer",
+    "offline_to_online_buffer",
     "open_dataset",
     "record_episode",
     "select_successful",

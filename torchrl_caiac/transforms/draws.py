@@ -107,7 +107,7 @@ class DonorBits(NamedTuple):
         return cls(words.reshape(-1), before, offset, size)
 
     def listed(self) -> DonorIndex:
-        """Returns the rows as numbers, 4 bytes for each, which are faster to look up."""
+        """Returns the rows as numbers, 4 bytes each, which are faster to look up."""
         width = len(self.words) // len(self.size)
         dtype = torch.int32 if 16 * width < 1 << 31 else torch.int64
         # At least one row, so that an index without any can be read.

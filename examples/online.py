@@ -1,0 +1,220 @@
+"""Trains offline, then collects, scores and trains in turn.
+
+``python online.py`` trains ``learner=td3_bc`` on data of Fetch-Push, with
+and without counterfactuals. Then, in each round, collectors play episodes with
+the policy and some noise, the method scores them, and training goes on with batches
+of offline and online transitions. ``online.episodes=0`` collects nothing, for
+comparison. The policies before the first and after the last round play from the test
+starts. ``size=quick`` is a smoke run, with ``online.rounds=2`` and the like.
+
+The table is ``<publish>/online.csv``. Rounds that are finished are not repeated: a run
+resumes at the last one, with the episodes that it has collected. Workers draw their own
+noise, so a resumed run does not end with the same weights.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import MultiSyncCollector
+from torchrl.data import Bounded
+from torchrl.envs import DoubleToFloat, EnvBase, TransformedEnv
+from torchrl.modules import AdditiveGaussianModule
+
+from environments.fetch_push import FetchPush
+from score import make_scoring
+from shared.console import start
+from shared.parts import make_environment, make_method, run_folder
+from shared.settings import keep_settings
+from study import prepare
+from torchrl_caiac._files import read_json, whole_file, write_json
+from torchrl_caiac.checkpoint import TrainingCheckpoint
+from torchrl_caiac.data import (
+    load_transitions,
+    offline_buffer,
+    offline_to_online_buffer,
+    write_transitions,
+)
+from torchrl_caiac.envs import make_fetch_push_env
+from train import train
+
+_LOGGER = logging.getLogger(__name__)
+COLUMNS = ("method", "seed", "episodes", "round", "split", "starts", "value")
+
+
+def make_env(steps: int) -> EnvBase:
+    """Returns the environment of one worker, whose episodes have ``steps`` steps."""
+    env = make_fetch_push_env(2, max_episode_steps=steps)
+    return TransformedEnv(env, DoubleToFloat())
+
+
+def collect_episodes(policy: Any, cfg: DictConfig, seed: int) -> TensorDict:
+    """Returns whole episodes that workers play with noise, ``[T]``."""
+    settings, steps = cfg.online, cfg.env.collect.steps
+    workers = min(settings.workers, settings.episodes)
+    if settings.episodes % workers:
+        raise ValueError(
+            f"online.episodes is {settings.episodes}, expected a multiple of "
+            f"online.workers, {workers}: each worker plays whole episodes"
+        )
+    frames = settings.episodes * steps
+    noise = AdditiveGaussianModule(
+        Bounded(-1.0, 1.0, (4,)),
+        sigma_init=settings.noise,
+        sigma_end=settings.noise,
+        annealing_num_steps=1,
+    )
+    collector = MultiSyncCollector(
+        [partial(make_env, steps)] * workers,
+        TensorDictSequential(policy, noise),
+        frames_per_batch=frames,
+        total_frames=frames,
+        reset_at_each_iter=True,
+        cat_results=0,
+    )
+    try:
+        collector.set_seed(seed)
+        (batch,) = [part.clone() for part in collector]
+    finally:
+        collector.shutdown()
+    batch = batch.reshape(-1)
+    keys = ("observation", "achieved_goal", "desired_goal")
+    ends = ("reward", "done", "terminated", "truncated")
+    rows = batch.select("action", *keys, *[("next", key) for key in (*keys, *ends)])
+    return rows.set("episode", torch.arange(frames) // steps)
+
+
+def online_rows(
+    learner: Any, policy: Any, cfg: DictConfig, method: str, folder: Path, number: int
+) -> TensorDictBase:
+    """Returns the episodes of all rounds up to a number, scored, for learning."""
+    path = folder / f"round-{number}"
+    if not path.exists():
+        seed = 1000 * (learner_seed(folder) + 1) + number
+        write_transitions(
+            collect_episodes(policy, cfg, seed),
+            path,
+            action_bounds=([-1.0] * 4, [1.0] * 4),
+        )
+    parts, first = [], 0
+    for i in range(1, number + 1):
+        stored = load_transitions(folder / f"round-{i}")
+        make_method(cfg, method).score(offline_buffer(stored, 1), make_scoring(cfg))
+        part = learner.learning_rows(load_transitions(folder / f"round-{i}"))
+        part["episode"] += first
+        first = int(part["episode"].max()) + 1
+        parts.append(part)
+    return torch.cat(parts)
+
+
+def learner_seed(folder: Path) -> int:
+    """Returns the seed in the name of the folder of a run."""
+    return int(folder.parent.name.rpartition("seed")[2])
+
+
+def success(
+    policy: Any, cfg: DictConfig, folder: Path, number: int, split: Any
+) -> dict[str, Any]:
+    """Plays from the starts of a split, unless this was done; returns the share."""
+    path = folder / f"{split}-{number}.json"
+    if not path.exists():
+        environment = make_environment(cfg)
+        episodes = environment.play(policy, learner_seed(folder), folder, split=split)
+        value = float(np.mean([e[environment.success_key] for e in episodes]))
+        write_json(path, {"starts": len(episodes), "value": value})
+    found = read_json(path, "evaluation", "delete it")
+    return {"round": number, "split": split, **found}
+
+
+def run(cfg: DictConfig, method: str, seed: int) -> Iterator[dict[str, Any]]:
+    """Trains offline and then online; yields the success before and after."""
+    settings = cfg.online
+    folder = run_folder(cfg, method, seed) / f"online-{settings.episodes}"
+    folder.mkdir(parents=True, exist_ok=True)
+    learner = train(cfg, method, seed)
+    if not isinstance(learner.environment, FetchPush):
+        raise ValueError("online.py collects in Fetch-Push only: set env=fetch_push")
+    kept = OmegaConf.to_container(settings, resolve=True)
+    kept = {key: value for key, value in kept.items() if key != "rounds"}
+    kept |= {"offline": cfg.learner.steps, **learner.kept_settings(seed)}
+    keep_settings(folder, "online", kept)
+    checkpoint = TrainingCheckpoint(
+        folder / "checkpoint.zip", settings=kept, **learner.parts
+    )
+
+    def policy() -> Any:
+        return learner.load_policy(learner.policy_state())
+
+    before = checkpoint.load(max_step=settings.rounds)
+    if not before:
+        for split in ("validation", "test"):
+            success(policy(), cfg, folder, 0, split)
+    offline = learner.rb
+    for number in range(before + 1, settings.rounds + 1):
+        if settings.episodes:
+            rows = online_rows(learner, policy(), cfg, method, folder, number)
+            learner.rb = offline_to_online_buffer(
+                offline,
+                learner.make_online_buffer(rows),
+                offline_fraction=settings.offline_fraction,
+                batch_size=learner.rows_at_once,
+            )
+        batches = learner.batches()
+        torch.set_flush_denormal(True)
+        try:
+            for step in range(1, settings.steps + 1):
+                learner.step(next(batches), step)
+        finally:
+            torch.set_flush_denormal(False)
+        success(policy(), cfg, folder, number, "validation")
+        if number == settings.rounds:
+            success(policy(), cfg, folder, number, "test")
+        checkpoint.save(number)
+    common = {"method": method, "seed": seed, "episodes": settings.episodes}
+    for number in range(settings.rounds + 1):
+        for split in ("validation", "test"):
+            if split == "validation" or number in (0, settings.rounds):
+                yield {**common, **success(None, cfg, folder, number, split)}
+
+
+def write_results(path: Path, new: list[dict[str, Any]]) -> None:
+    """Adds rows to the table, in the place of those of the same runs."""
+    rows: list[dict[str, Any]] = []
+    runs = {tuple(str(row[key]) for key in COLUMNS[:3]) for row in new}
+    if path.exists():
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    rows = [row for row in rows if tuple(row[k] for k in COLUMNS[:3]) not in runs]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as partial_file, partial_file.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*rows, *new])
+
+
+@hydra.main(version_base=None, config_path="conf", config_name="online")
+def main(cfg: DictConfig) -> None:
+    """Runs all methods and seeds."""
+    prepare(cfg)
+    for seed in cfg.seeds:
+        for method in cfg.method:
+            folder = run_folder(cfg, method, seed)
+            with start(cfg, folder=folder) as console, console.stage(folder.name):
+                write_results(
+                    Path(cfg.publish) / "online.csv", [*run(cfg, method, seed)]
+                )
+
+
+if __name__ == "__main__":
+    main()
