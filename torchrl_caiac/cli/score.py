@@ -51,8 +51,8 @@ _EPILOG = """\
 example:
   caiac score episodes.npz --layout ogbench/cube-double --out scored
 To resume an interrupted call, repeat it. In several processes, on one machine or more:
-  caiac score ... --workers 2
-  torchrun --nproc-per-node=2 -m torchrl_caiac score ...
+  caiac score DATA --layout L --out scored --workers 2
+  torchrun --nproc-per-node=2 -m torchrl_caiac score DATA ...
 """
 
 
