@@ -3,42 +3,23 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import signal
-import subprocess
-import sys
 import tempfile
-import textwrap
-import time
 from pathlib import Path
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorStorage
+from torchrl.data import ReplayBuffer
 
 from tests.influence.scoring import (
-    KEY,
-    LAYOUT,
     Failing,
-    Graph,
-    Read,
     definition,
     episodes,
-    filled,
-    ready,
     scores,
     square,
 )
-from tests.killing import running
-from torchrl_caiac import CAIACTransform
 from torchrl_caiac.data import load_transitions, offline_buffer
-from torchrl_caiac.influence import CAI, score_buffer
-from torchrl_caiac.influence.shards import scoring_progress
-from torchrl_caiac.modules import GaussianWorldModel
+from torchrl_caiac.influence import score_buffer
 
 PARTS = "caiac.score.parts"
 
