@@ -17,7 +17,10 @@ from torchrl_caiac.caiac_buffer import CAIACReplayBuffer
 from torchrl_caiac.transforms import HindsightGoal
 
 LAYOUT = EntityLayout(
-    {"arm": [0], "cup": [1]}, goal={"cup": [0]}, achieved={"cup": [1]}
+    {"arm": [0], "cup": [1]},
+    goal={"cup": [0]},
+    achieved={"cup": [1]},
+    fixed=["arm"],
 )
 
 

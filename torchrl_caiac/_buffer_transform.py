@@ -91,8 +91,8 @@ class RandomTransform(BufferTransform):
         else:
             return
         warnings.warn(
-            f"{type(self).__name__} draws in a process that was forked, with the random "
-            f"numbers of its parent, as its siblings would: {remedy}",
+            f"{type(self).__name__} draws in a process that was forked, with the "
+            f"random numbers of its parent, as its siblings would: {remedy}",
             stacklevel=2,
         )
 
