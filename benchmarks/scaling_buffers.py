@@ -2,8 +2,8 @@
 
 Run with ``python benchmarks/scaling_buffers.py``, which takes about two minutes and
 writes ``docs/results/scaling_buffers.txt``. The data are random, with the shapes of
-Fetch-Push with two cubes. Both buffers relabel goals and swap entities; a step is one of
-TD3 with both losses. What is measured is repeated in turn, since other work on the
+Fetch-Push with two cubes. Both buffers relabel goals and swap entities; a step is one
+of TD3 with both losses. What is measured is repeated in turn, since other work on the
 machine would else favour one.
 """
 
@@ -160,8 +160,8 @@ def main() -> None:
             f"{1 / whole[name]:16.1f}"
             for name in buffers
         ],
-        f"Transfer: {1e3 * transfer:.2f} ms, {transfer / sample['Ray']:.0%} of a sample "
-        f"and {transfer / whole['Ray']:.0%} of a step from Ray without prefetch.",
+        f"Transfer: {1e3 * transfer:.2f} ms, {transfer / sample['Ray']:.0%} of a "
+        f"sample and {transfer / whole['Ray']:.0%} of a step from Ray without prefetch.",
         f"Steps a second from Ray, relative to here: "
         f"{whole['here'] / whole['Ray']:.2f} without prefetch, "
         f"{whole['here, prefetch=1'] / whole['Ray, prefetch=1']:.2f} with it.",

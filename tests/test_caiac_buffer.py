@@ -41,8 +41,6 @@ from torchrl_caiac.objectives import GoalConditionedTD3Loss
 from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
 
-
-
 LAYOUT = EntityLayout(
     {"arm": [0], "cup": [1], "box": [2]},
     goal={"cup": [0], "box": [1]},

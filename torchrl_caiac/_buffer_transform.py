@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import warnings
 from typing import Any, NoReturn
 
 import torch
@@ -70,6 +72,29 @@ class RandomTransform(BufferTransform):
     def __init__(self, generator: torch.Generator | None) -> None:
         super().__init__()
         self.generator = generator
+        self._origin = _Process()
+
+    def warn_if_forked(self) -> None:
+        """Warns, once, in a forked process that draws the numbers of its parent.
+
+        So do its siblings, and TorchRL's samplers: all of them would get the same rows,
+        goals and donors. A process that was seeded after the fork draws its own.
+        """
+        origin = self._origin
+        if origin.pid == os.getpid():
+            return
+        self._origin = _Process()
+        if self.generator is not None:
+            remedy = "use set_generator, and set_rng of the buffer, in each process"
+        elif origin.seed == torch.initial_seed():
+            remedy = "call torch.manual_seed(seed + rank) in each process"
+        else:
+            return
+        warnings.warn(
+            f"{type(self).__name__} draws in a process that was forked, with the "
+            f"random numbers of its parent, as its siblings would: {remedy}",
+            stacklevel=2,
+        )
 
     def set_generator(self, generator: torch.Generator | None) -> None:
         """Sets the source of randomness.
@@ -78,6 +103,7 @@ class RandomTransform(BufferTransform):
             generator (torch.Generator, optional): ``None`` for torch's default one.
         """
         self.generator = generator
+        self._origin = _Process()
 
     def get_extra_state(self) -> dict[str, torch.Tensor]:
         """Returns the state of the generator, for ``state_dict``."""
@@ -88,3 +114,13 @@ class RandomTransform(BufferTransform):
         """Restores what :meth:`get_extra_state` returned."""
         if self.generator is not None and "generator" in state:
             self.generator.set_state(state["generator"].cpu())
+
+
+class _Process:
+    """The process that a transform was created in, and its seed."""
+
+    def __init__(self) -> None:
+        self.pid, self.seed = os.getpid(), torch.initial_seed()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Process, ()  # a copy belongs to the process that makes it

@@ -8,11 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-import textwrap
-import time
 from pathlib import Path
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -32,6 +29,14 @@ from torchrl_caiac._files import claim_folder
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.influence.shards import scoring_progress
+    Failing,
+    definition,
+    episodes,
+    scores,
+    square,
+)
+from torchrl_caiac.data import load_transitions, offline_buffer
+from torchrl_caiac.influence import score_buffer
 
 PARTS = "caiac.score.parts"
 

@@ -86,7 +86,9 @@ def score_buffer_ray(
     task = ray.remote(**options)(_score_shard)
     # Once for all tasks.
     settings = ray.put((estimator, {**kwargs, "key": key}))
-    waiting = [task.remote(path, settings, (i, num_workers)) for i in range(num_workers)]
+    waiting = [
+        task.remote(path, settings, (i, num_workers)) for i in range(num_workers)
+    ]
     with tqdm(unit=" rows", disable=not progress, desc="scores") as bar:
         try:
             while waiting:

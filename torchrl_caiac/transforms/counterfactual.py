@@ -452,6 +452,7 @@ class CounterfactualTransform(RandomTransform, ABC):
                 finite, a window is not one of successive rows, or a score belongs to
                 another state.
         """
+        self.warn_if_forked()
         self._check_buffer(tensordict)
         shape = tensordict.batch_size
         if len(shape) != 1:

@@ -363,6 +363,7 @@ class HindsightGoal(FutureGoal):
             KeyError: goals or rewards are missing.
             ValueError: goals or rewards have the wrong shape.
         """
+        self.warn_if_forked()
         goals = self.take_goals()
         shape = tensordict.batch_size
         if len(shape) != 1:

@@ -260,6 +260,7 @@ class WindowGoal(FutureGoal):
             RuntimeError: no goals were drawn for this batch, or it was augmented
                 already.
         """
+        self.warn_if_forked()
         goals = self.take_goals()
         if goals is None:
             raise RuntimeError(
