@@ -161,7 +161,7 @@ def main() -> None:
             for name in buffers
         ],
         f"Transfer: {1e3 * transfer:.2f} ms, {transfer / sample['Ray']:.0%} of a "
-        f"sample and {transfer / whole['Ray']:.0%} of a step from Ray without prefetch.",
+        f"sample and {transfer / whole['Ray']:.0%} of a step without prefetch.",
         f"Steps a second from Ray, relative to here: "
         f"{whole['here'] / whole['Ray']:.2f} without prefetch, "
         f"{whole['here, prefetch=1'] / whole['Ray, prefetch=1']:.2f} with it.",

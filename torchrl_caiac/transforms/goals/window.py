@@ -266,9 +266,9 @@ class WindowGoal(FutureGoal):
             raise RuntimeError(
                 "no goals were drawn for this batch: pass the same WindowGoal as "
                 "sample_unit=... of the replay buffer, and get data by rb.sample() "
-                "(rb.storage[...] reads rows as they are stored). For a buffer in another "
-                "process, create a CAIACReplayBuffer there, since both would be sent "
-                "apart"
+                "(rb.storage[...] reads rows as they are stored). For a buffer in "
+                "another process, create a CAIACReplayBuffer there, since both would "
+                "be sent apart"
             )
         if tensordict.get(self.keys.counterfactual, None) is not None:
             raise RuntimeError(
