@@ -35,7 +35,7 @@ from torchrl.modules import AdditiveGaussianModule
 from environments.fetch_push import FetchPush
 from score import make_scoring
 from shared.console import start
-from shared.parts import make_environment, make_method, run_folder
+from shared.parts import make_environment, run_folder
 from shared.settings import keep_settings
 from study import prepare
 from torchrl_caiac._files import read_json, whole_file, write_json
@@ -96,21 +96,26 @@ def collect_episodes(policy: Any, cfg: DictConfig, seed: int) -> TensorDict:
 
 
 def online_rows(
-    learner: Any, policy: Any, cfg: DictConfig, method: str, folder: Path, number: int
+    learner: Any,
+    policy: Any,
+    cfg: DictConfig,
+    folder: Path,
+    first_seed: int,
+    number: int,
 ) -> TensorDictBase:
     """Returns the episodes of all rounds up to a number, scored, for learning."""
     path = folder / f"round-{number}"
     if not path.exists():
-        seed = 1000 * (learner_seed(folder) + 1) + number
         write_transitions(
-            collect_episodes(policy, cfg, seed),
+            collect_episodes(policy, cfg, first_seed + number),
             path,
             action_bounds=([-1.0] * 4, [1.0] * 4),
         )
     parts, first = [], 0
     for i in range(1, number + 1):
         stored = load_transitions(folder / f"round-{i}")
-        make_method(cfg, method).score(offline_buffer(stored, 1), make_scoring(cfg))
+        if learner.method.score_key is not None:
+            learner.method.score(offline_buffer(stored, 1), make_scoring(cfg))
         part = learner.learning_rows(load_transitions(folder / f"round-{i}"))
         part["episode"] += first
         first = int(part["episode"].max()) + 1
@@ -118,19 +123,14 @@ def online_rows(
     return torch.cat(parts)
 
 
-def learner_seed(folder: Path) -> int:
-    """Returns the seed in the name of the folder of a run."""
-    return int(folder.parent.name.rpartition("seed")[2])
-
-
 def success(
-    policy: Any, cfg: DictConfig, folder: Path, number: int, split: Any
+    policy: Any, cfg: DictConfig, seed: int, folder: Path, number: int, split: Any
 ) -> dict[str, Any]:
     """Plays from the starts of a split, unless this was done; returns the share."""
     path = folder / f"{split}-{number}.json"
     if not path.exists():
         environment = make_environment(cfg)
-        episodes = environment.play(policy, learner_seed(folder), folder, split=split)
+        episodes = environment.play(policy, seed, folder, split=split)
         value = float(np.mean([e[environment.success_key] for e in episodes]))
         write_json(path, {"starts": len(episodes), "value": value})
     found = read_json(path, "evaluation", "delete it")
@@ -142,13 +142,14 @@ def run(cfg: DictConfig, method: str, seed: int) -> Iterator[dict[str, Any]]:
     settings = cfg.online
     folder = run_folder(cfg, method, seed) / f"online-{settings.episodes}"
     folder.mkdir(parents=True, exist_ok=True)
-    learner = train(cfg, method, seed)
+    learner: Any = train(cfg, method, seed)
     if not isinstance(learner.environment, FetchPush):
         raise ValueError("online.py collects in Fetch-Push only: set env=fetch_push")
     kept = OmegaConf.to_container(settings, resolve=True)
     kept = {key: value for key, value in kept.items() if key != "rounds"}
     kept |= {"offline": cfg.learner.steps, **learner.kept_settings(seed)}
     keep_settings(folder, "online", kept)
+    first_seed = 1000 * (seed + 1)  # of the starts of collected episodes
     checkpoint = TrainingCheckpoint(
         folder / "checkpoint.zip", settings=kept, **learner.parts
     )
@@ -159,11 +160,11 @@ def run(cfg: DictConfig, method: str, seed: int) -> Iterator[dict[str, Any]]:
     before = checkpoint.load(max_step=settings.rounds)
     if not before:
         for split in ("validation", "test"):
-            success(policy(), cfg, folder, 0, split)
+            success(policy(), cfg, seed, folder, 0, split)
     offline = learner.rb
     for number in range(before + 1, settings.rounds + 1):
         if settings.episodes:
-            rows = online_rows(learner, policy(), cfg, method, folder, number)
+            rows = online_rows(learner, policy(), cfg, folder, first_seed, number)
             learner.rb = offline_to_online_buffer(
                 offline,
                 learner.make_online_buffer(rows),
@@ -177,15 +178,15 @@ def run(cfg: DictConfig, method: str, seed: int) -> Iterator[dict[str, Any]]:
                 learner.step(next(batches), step)
         finally:
             torch.set_flush_denormal(False)
-        success(policy(), cfg, folder, number, "validation")
+        success(policy(), cfg, seed, folder, number, "validation")
         if number == settings.rounds:
-            success(policy(), cfg, folder, number, "test")
+            success(policy(), cfg, seed, folder, number, "test")
         checkpoint.save(number)
     common = {"method": method, "seed": seed, "episodes": settings.episodes}
     for number in range(settings.rounds + 1):
         for split in ("validation", "test"):
             if split == "validation" or number in (0, settings.rounds):
-                yield {**common, **success(None, cfg, folder, number, split)}
+                yield {**common, **success(None, cfg, seed, folder, number, split)}
 
 
 def write_results(path: Path, new: list[dict[str, Any]]) -> None:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = ("collect", "fit", "score", "train", "evaluate", "study", "figures")
-SCRIPTS += ("compare_influence", "compare_precision")
+SCRIPTS += ("compare_influence", "compare_precision", "online")
 SCRIPTS += ("suggest_thresholds", "sweep_variance_floor")
 SHARED = ("console", "log", "parts", "results", "settings", "studies", "tables")
 SHARED += ("thresholds",)

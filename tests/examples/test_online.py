@@ -1,0 +1,68 @@
+"""Training offline, then collecting, scoring and training in turn."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_caiac.data import load_transitions
+
+
+@pytest.fixture(scope="module")
+def cfg(steps, compose, tmp_path_factory):
+    """A small configuration, after the preparation."""
+    cfg = compose(config="online", out=tmp_path_factory.mktemp("online"))
+    online = {"rounds": 2, "episodes": 2, "steps": 3, "workers": 1}
+    cfg = OmegaConf.merge(cfg, {"online": online})
+    steps.collect.collect(cfg)
+    steps.score.score(cfg)
+    return cfg
+
+
+def test_rounds_collect_score_and_resume(cfg, steps, monkeypatch):
+    one = OmegaConf.merge(cfg, {"online": {"rounds": 1}})
+    found = [*steps.online.run(one, "caiac", 0)]
+    assert [(row["round"], row["split"]) for row in found] == [
+        (0, "validation"),
+        (0, "test"),
+        (1, "validation"),
+        (1, "test"),
+    ]
+    folder = steps.parts.run_folder(cfg, "caiac", 0) / "online-2"
+    rows = load_transitions(folder / "round-1")
+    assert len(rows) == 200 and rows["next", "done"].sum() == 2
+    assert rows["caiac", "score"].isfinite().all()
+    # The second round has the episodes of both, and repeats nothing of the first.
+    collected = []
+    collect = steps.online.collect_episodes
+    monkeypatch.setattr(
+        steps.online,
+        "collect_episodes",
+        lambda *args: collected.append(args) or collect(*args),
+    )
+    more = [*steps.online.run(cfg, "caiac", 0)]
+    assert len(collected) == 1
+    assert [row["round"] for row in more] == [0, 0, 1, 2, 2]
+    assert more[:3] == found[:3]
+    assert [*steps.online.run(cfg, "caiac", 0)] == more
+    assert len(collected) == 1
+
+
+def test_results_of_a_run_replace_those_before(steps, tmp_path):
+    row = dict.fromkeys(steps.online.COLUMNS, 1)
+    other = row | {"seed": 2}
+    path = tmp_path / "online.csv"
+    steps.online.write_results(path, [row])
+    steps.online.write_results(path, [other])
+    steps.online.write_results(path, [row | {"value": 0.5}])
+    with path.open(newline="") as file:
+        values = [(r["seed"], r["value"]) for r in csv.DictReader(file)]
+    assert values == [("2", "1"), ("1", "0.5")]
+
+
+def test_episodes_are_shared_evenly(cfg, steps):
+    uneven = OmegaConf.merge(cfg, {"online": {"episodes": 3, "workers": 2}})
+    with pytest.raises(ValueError, match="multiple"):
+        steps.online.collect_episodes(None, uneven, 0)
