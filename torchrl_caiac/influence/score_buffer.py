@@ -40,7 +40,12 @@ from torchrl_caiac.influence.score_pass import (
 from torchrl_caiac.influence.score_record import score_settings, settings_digest
 from torchrl_caiac.influence.score_spread import warn_of_one_side
 from torchrl_caiac.influence.scorer import Scorer, layout_of
-from torchrl_caiac.influence.shards import check_shard, score_shard, settle_parts
+from torchrl_caiac.influence.shards import (
+    check_shard,
+    has_parts,
+    score_shard,
+    settle_parts,
+)
 from torchrl_caiac.trajectories import trajectory_index
 
 __all__ = ["score_buffer"]
@@ -300,8 +305,9 @@ def score_buffer(
 def _one_pass(own: ScorePass, *, overwrite: bool, progress: bool) -> bool:
     """Scores all rows without a valid score; returns whether there were none."""
     index, scorer = own.index, own.scorer
-    with _claimed(own):
-        settle_parts(own, overwrite=overwrite)
+    if has_parts(own):  # else nothing is locked, so that a folder may be read-only
+        with _claimed(own):
+            settle_parts(own, overwrite=overwrite)
     before = None if overwrite else own.read_record()
     found = None if overwrite else existing_scores(own)
     if found is None:

@@ -33,6 +33,7 @@ from torchrl_caiac.influence.score_record import settings_that_differ
 __all__ = [
     "ScoringProgress",
     "check_shard",
+    "has_parts",
     "score_shard",
     "scoring_progress",
     "settle_parts",
@@ -145,11 +146,18 @@ def score_shard(
     return joined
 
 
+def has_parts(own: ScorePass) -> bool:
+    """Returns whether processes that score together have left scores in the folder."""
+    if own.folder is None:
+        return False
+    return ScoreParts.of(own.folder, own.key).root.exists()
+
+
 def settle_parts(own: ScorePass, *, overwrite: bool) -> None:
     """Moves what processes have scored together into the leaf, to go on alone.
 
     Args:
-        own (ScorePass): what is scored. No other process is at work.
+        own (ScorePass): what is scored, in a folder. No other process is at work.
 
     Keyword Args:
         overwrite (bool): discard it instead.
@@ -157,8 +165,7 @@ def settle_parts(own: ScorePass, *, overwrite: bool) -> None:
     Raises:
         ValueError: it has other settings.
     """
-    if own.folder is None:
-        return
+    assert own.folder is not None
     parts = ScoreParts.of(own.folder, own.key)
     plan = None if overwrite else parts.read()
     if plan is not None:
