@@ -239,6 +239,7 @@ def test_a_transform_finds_the_rows_of_its_batch():
         for found, row in seen:
             assert found is not None and found[0] is buffer
             assert torch.equal(flat_rows(found[1], buffer.storage), row)
+            assert torch.equal(found[2]["row"], row)
             assert sampling_buffer() is None
     assert sampled_rows() is None
 

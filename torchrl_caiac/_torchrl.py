@@ -274,12 +274,13 @@ def sampling_buffer() -> ReplayBuffer | None:
     return None if found is None else found[0]
 
 
-def sampled_rows() -> tuple[ReplayBuffer, Any] | None:
+def sampled_rows() -> tuple[ReplayBuffer, Any, Any] | None:
     """Returns the buffer that is sampling in this thread, and the rows that it drew.
 
     Returns:
-        tuple, optional: the buffer, and the index into its storage, integer ``[B]`` or
-        the coordinates in each dimension; ``None`` if no buffer is sampling.
+        tuple, optional: the buffer; the index into its storage, integer ``[B]`` or the
+        coordinates in each dimension; and the batch that it read there, which its
+        transforms may have changed in place. ``None`` if no buffer is sampling.
 
     Examples:
         >>> import torch
@@ -299,7 +300,7 @@ def sampled_rows() -> tuple[ReplayBuffer, Any] | None:
             variables = frame.f_locals
             buffer = variables.get("self")
             if isinstance(buffer, ReplayBuffer):
-                return buffer, variables.get("index")
+                return buffer, variables.get("index"), variables.get("data")
         frame = frame.f_back  # type: ignore[assignment]
     return None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import threading
 
 import pytest
 import torch
@@ -261,6 +262,74 @@ def test_prefetched_batches_are_those_of_their_rows() -> None:
         rb.sample()
 
 
+@pytest.mark.parametrize("prefetch", [0, 3])
+def test_rows_replaced_after_the_draw_are_kept(prefetch: int) -> None:
+    # Their successors are gone, so that what they lock is unknown.
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(40),
+        batch_size=200,
+        **({"prefetch": prefetch} if prefetch else {}),
+    )
+    free = torch.zeros(40, 3, dtype=torch.bool)
+    rb.extend(make_rows(free, torch.arange(40) // 10))
+    once = threading.Lock()
+
+    def write(td: TensorDict) -> TensorDict:
+        """Replaces the first 10 rows, after the first batch was drawn."""
+        if once.acquire(blocking=False):
+            later = make_rows(free[:10], torch.full((10,), 4))
+            later["observation"] += 1000.0
+            thread = threading.Thread(target=rb.extend, args=(later,))
+            thread.start()
+            thread.join(timeout=60)
+            assert not thread.is_alive()
+        return td
+
+    rb.append_transform(write)
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    batches = [rb.sample() for _ in range(5)]
+    # The arm tells from which row a state is. Old rows were replaced, and are kept.
+    arms = [batch["observation"][:, 0] for batch in batches]
+    first = batches[int(torch.stack([(arm < 30).any() for arm in arms]).nonzero()[0])]
+    old = first["observation"][:, 0] < 30
+    assert old.any()
+    assert not first["caiac", "swapped"][old].any()
+    assert first["caiac", "swapped"][~old][:, 1:].all()
+    last = batches[-1]
+    assert (last["observation"][:, 0] >= 30).all()
+    assert last["caiac", "swapped"][:, 1:].all()
+
+
+def test_a_full_ring_is_written_while_batches_are_prefetched() -> None:
+    influenced, episode = make_influenced()
+    rb = ReplayBuffer(storage=LazyTensorStorage(120), batch_size=64, prefetch=3)
+    rb.extend(make_rows(influenced, episode))
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    stop, failed = threading.Event(), []
+
+    def write() -> None:
+        number = 1
+        while not stop.is_set():
+            part = make_rows(influenced[:20], episode[:20] + 6 * number)
+            part["observation"] += 360.0 * number
+            try:
+                rb.extend(part)
+            except Exception as error:  # reported below, in the main thread
+                failed.append(error)
+                return
+            number += 1
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    try:
+        swapped = sum(int(rb.sample()["caiac", "swapped"].sum()) for _ in range(300))
+    finally:
+        stop.set()
+        thread.join(timeout=60)
+    assert not failed and not thread.is_alive()
+    assert swapped > 0
+
+
 def test_other_batches_are_refused() -> None:
     influenced, episode = make_influenced()
     rows = make_rows(influenced, episode)
@@ -278,6 +347,17 @@ def test_other_batches_are_refused() -> None:
     rb.extend(rows.exclude("episode"))
     rb.append_transform(transform)
     with pytest.raises(KeyError, match="trajectory ids"):
+        rb.sample()
+
+
+def test_scores_changed_in_place_are_refused() -> None:
+    influenced, episode = make_influenced()
+    rb = ReplayBuffer(storage=LazyTensorStorage(120), batch_size=32)
+    rb.extend(make_rows(influenced, episode))
+    rb.append_transform(lambda td: td.set(("caiac", "score"), torch.rand(32, 3)))
+    rb.append_transform(CAIACTransform(LAYOUT, 0.05, 1.0, lookahead="next"))
+    assert not rb.sample()["caiac", "swapped"].any()  # rows might have been replaced
+    with pytest.raises(RuntimeError, match="not those of the storage"):
         rb.sample()
 
 

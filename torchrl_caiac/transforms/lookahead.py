@@ -39,7 +39,8 @@ NEVER = 2**31 - 1
 
 # Scores that are compared with the threshold together.
 _CHUNK = 1 << 20
-_BUILDING = threading.Lock()  # batches may be prefetched by several threads
+# Batches may be prefetched by several threads. It is taken before the buffer's lock.
+_BUILDING = threading.RLock()
 
 
 def check_lookahead(lookahead: object) -> LookaheadArgument:
@@ -224,6 +225,7 @@ class Lookahead:
         self._tables: weakref.WeakKeyDictionary[Any, tuple[Any, torch.Tensor]] = (
             weakref.WeakKeyDictionary()
         )
+        self._seen = threading.local()  # the revision at the last batch of a thread
 
     def table(self, source: ReplayBuffer | TensorStorage) -> torch.Tensor:
         """Returns what each row of a buffer locks.
@@ -296,15 +298,19 @@ class Lookahead:
         return table
 
     def locked(
-        self, source: ReplayBuffer, index: Any, batch: TensorDictBase
+        self, source: ReplayBuffer, index: Any, drawn: Any, batch: TensorDictBase
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Returns what the rows of a batch lock.
+
+        Other threads may write to the buffer after the batch was drawn. A row that was
+        replaced in between locks every entity, since its trajectory is unknown.
 
         Args:
             source (ReplayBuffer): the buffer that samples.
             index (torch.Tensor or tuple): the rows that it drew.
+            drawn (TensorDictBase): what it read there, ``[B]``.
             batch (TensorDictBase): the batch, ``[B]``. Its scores, and fingerprints if
-                there are any, are compared with those of the rows.
+                there are any, are compared with those that were drawn.
 
         Returns:
             tuple of torch.Tensor: bool ``[B, N]``; and on an accelerator, which is not
@@ -313,7 +319,7 @@ class Lookahead:
 
         Raises:
             RuntimeError: the batch does not consist of these rows, or those of several
-                buffers.
+                buffers; or its scores or trajectory ids were changed.
         """
         storage = source.storage
         if isinstance(storage, StorageEnsemble):
@@ -322,38 +328,73 @@ class Lookahead:
                 f"{type(source).__name__} samples: join the data in one buffer, sample "
                 "the buffers one by one, or leave out lookahead"
             )
-        table, rows = self.table(source), flat_rows(index, storage)
+        rows = flat_rows(index, storage)
+        own = (self.score_key, fingerprint_key(self.score_key))
         device = batch.get(self.score_key).device
-        late, differs = LateCheck.needed(device), None
+        late = LateCheck.needed(device)
+        differs = torch.zeros((), dtype=torch.bool, device=device)
         same = len(rows) == len(batch)
         if same:
-            data = storage_rows(storage)
-            differs = _differs(batch, data, rows, self.score_key)
-            known = fingerprint_key(self.score_key)
-            if all(td.get(known, None) is not None for td in (batch, data)):
-                differs = differs | _differs(batch, data, rows, known)
+            differs = _differing(batch, drawn, own).any()
             same = late or not bool(differs)
         if not same:
             raise RuntimeError(
                 "the batch does not have the rows that the buffer drew, so that the "
                 "trajectories of its rows are unknown: append this transform before "
-                "others that select, repeat or reorder rows, leave out prefetch if "
-                "rows are replaced while batches are prefetched, or leave out lookahead"
+                "others that select, repeat or reorder rows, or leave out lookahead"
             )
-        return pick_rows(table, rows).to(device), differs if late else None
+        with _BUILDING, writes_paused(source):  # no write between table and rows
+            found = pick_rows(self.table(source), rows).to(device)
+            keys = own if self.keys.trajectory is None else (*own, self.keys.trajectory)
+            replaced = _differing(batch, storage_rows(storage), keys, rows)
+            revision = storage_revision(storage)
+        last = getattr(self._seen, "last", None)
+        self._seen.last = weakref.ref(storage), revision
+        if last is not None and last[0]() is storage and last[1] == revision:
+            # Nothing was written since this thread drew, so that no row was replaced.
+            differs = differs | replaced.any()
+            if not late and bool(differs):
+                raise RuntimeError(
+                    f"{self.score_key!r}, or the trajectory ids, of the batch are not "
+                    "those of the storage: append this transform before those that "
+                    "change them in place, or leave out lookahead"
+                )
+        return found | replaced.unsqueeze(-1), differs if late else None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: self.__dict__[key] for key in self.__dict__ if key != "_tables"}
+        left_out = ("_tables", "_seen")
+        return {k: value for k, value in self.__dict__.items() if k not in left_out}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.refresh()
 
 
-def _differs(
-    batch: TensorDictBase, data: TensorDictBase, rows: torch.Tensor, key: NestedKey
+def _differing(
+    batch: TensorDictBase,
+    data: TensorDictBase,
+    keys: tuple[NestedKey, ...],
+    rows: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns whether a leaf of a batch has other values than rows of the data."""
-    leaf = batch.get(key)
-    found = pick_rows(plain_tensor(data.get(key)), rows).to(leaf)
-    return (found.nan_to_num() != leaf.nan_to_num()).any()
+    """Returns which rows of a batch have other values than rows of the data.
+
+    Args:
+        batch (TensorDictBase): the batch, ``[B]``.
+        data (TensorDictBase): the data.
+        keys (tuple of NestedKey): the leaves, which may be missing, but the first one.
+        rows (torch.Tensor, optional): ``[B]``. Defaults to the first ``B``.
+
+    Returns:
+        torch.Tensor: bool ``[B]``.
+    """
+    device = batch.get(keys[0]).device
+    differ = torch.zeros(len(batch), dtype=torch.bool, device=device)
+    for key in keys:
+        leaf, found = batch.get(key, None), data.get(key, None)
+        if leaf is None or found is None or leaf is found:
+            continue
+        found = plain_tensor(found)
+        found = (found if rows is None else pick_rows(found, rows)).to(leaf)
+        other = found.nan_to_num() != leaf.nan_to_num()
+        differ |= other.reshape(len(batch), -1).any(-1)
+    return differ
