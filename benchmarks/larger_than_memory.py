@@ -202,10 +202,15 @@ def warm(kind: str, data: TensorDictBase) -> Call:
 # --- measuring -----------------------------------------------------------------------
 
 
-def anonymous() -> int:
-    """Returns the resident anonymous memory of this process, in bytes."""
+def status(name: str) -> int:
+    """Returns a size of this process from ``/proc``, in bytes."""
     text = Path("/proc/self/status").read_text()
-    return int(text.split("RssAnon:")[1].split()[0]) << 10
+    return int(text.split(f"{name}:")[1].split()[0]) << 10
+
+
+def anonymous() -> int:
+    """Returns the resident anonymous memory of this process."""
+    return status("RssAnon")
 
 
 class Peak(threading.Thread):
@@ -224,10 +229,12 @@ class Peak(threading.Thread):
 
 def measure(name: str, folder: Path, work: Path, limit: int) -> None:
     """Measures one step in this process, and prints its line."""
-    if limit:
-        resource.setrlimit(resource.RLIMIT_DATA, (limit << 20, limit << 20))
     torch.set_num_threads(1)
     data = load_transitions(folder)
+    if limit:
+        # The limit is on what is reserved: imports reserve more than they use.
+        most = (limit << 20) + status("VmData") - anonymous()
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     call = steps(folder, work)[name](data)
     peak = Peak()
     peak.start()

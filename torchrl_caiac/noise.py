@@ -221,7 +221,9 @@ def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDic
         )
     if len(data) <= max_rows:
         return data
-    return data[torch.linspace(0, len(data) - 1, max_rows).round().long()]
+    # float32 does not hold the numbers of rows from 16.7 million on
+    rows = torch.linspace(0, len(data) - 1, max_rows, dtype=torch.float64)
+    return data[rows.round().long()]
 
 
 def _entity(

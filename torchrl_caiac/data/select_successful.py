@@ -103,14 +103,15 @@ def select_successful(
     if trajectories is not None:
         check_int("trajectories", trajectories, 1)
     index = trajectory_index(data, trajectory_key=trajectory_key, done_key=done_key)
-    rows = index.rows(torch.arange(len(data), device=index.device)).cpu()
-    successes = _successes(data, key, above)[rows]
-    lengths = index.lengths.cpu()
-    number = torch.arange(len(lengths)).repeat_interleave(lengths)
-    # For each row, the successes of its trajectory in earlier rows.
-    count = successes.long().cumsum(0)
-    before = torch.cat([count.new_zeros(1), count])[(index.ends.cpu() + 1) - lengths]
-    is_successful = count[index.ends.cpu()] > before
+    successes = _successes(data, key, above)
+    if not index.is_storage_order:
+        rows = index.rows(torch.arange(len(data), device=index.device)).cpu()
+        successes = successes[rows]
+    lengths, ends = index.lengths.cpu(), index.ends.cpu()
+    at = successes.nonzero()[:, 0]
+    number = torch.searchsorted(ends, at)
+    is_successful = torch.zeros(len(ends), dtype=torch.bool)
+    is_successful[number] = True
     found = int(is_successful.sum())
     if found < (trajectories or 1):
         raise ValueError(
@@ -120,13 +121,18 @@ def select_successful(
         )
     if trajectories is not None:
         is_successful &= is_successful.cumsum(0) <= trajectories
-    kept = is_successful[number]
+    starts, last = ends + 1 - lengths, ends
     if cut:
-        earlier = count - successes.long() - before[number]
-        kept &= earlier == 0
-    chosen = data[rows[kept].to(data.device or "cpu")].to_tensordict()
+        last = ends.scatter_reduce(0, number, at, "amin")
+    # The positions of the rows that are kept, trajectory by trajectory.
+    sizes = (last + 1 - starts)[is_successful]
+    number = is_successful.nonzero()[:, 0].repeat_interleave(sizes)
+    shift = starts[is_successful] - (sizes.cumsum(0) - sizes)
+    position = torch.arange(len(number)) + shift.repeat_interleave(sizes)
+    rows = index.rows(position.to(index.device))
+    chosen = data[rows.to(data.device or "cpu")].to_tensordict()
     if cut:
-        _end(chosen, number[kept], done_key)
+        _end(chosen, number, done_key)
     if path is None:
         return chosen
     bounds = action_bounds(data)

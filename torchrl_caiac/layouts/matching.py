@@ -65,7 +65,9 @@ def _fits(description: LayoutDescription, data: TensorDictBase) -> bool:
         return False
     rows = value.reshape(-1, value.shape[-1])
     if len(rows) > _MOST_ROWS:
-        rows = rows[torch.linspace(0, len(rows) - 1, _MOST_ROWS).long()]
+        # float32 does not hold the numbers of rows from 16.7 million on
+        spread = torch.linspace(0, len(rows) - 1, _MOST_ROWS, dtype=torch.float64)
+        rows = rows[spread.long()]
     rows = rows.to(torch.float64)
     return all(
         _share(part, rows, place) >= _SHARE for part, place in description.places
