@@ -17,6 +17,7 @@ from torchrl.data.replay_buffers import Storage
 from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_caiac._buffer_transform import RandomTransform
+from torchrl_caiac._torchrl import without_generator
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.data.offline_buffer import offline_storage
 from torchrl_caiac.influence import score_buffer
@@ -139,12 +140,12 @@ class CAIACReplayBuffer(TensorDictReplayBuffer):
         parts += [
             _made(f"transforms[{i}]", f, Transform) for i, f in enumerate(transforms)
         ]
-        generator = None
-        if seed is not None:
-            generator = torch.Generator().manual_seed(seed)
-            for part in parts:
-                if isinstance(part, RandomTransform) and part.generator is None:
-                    part.set_generator(generator)
+        self._drawing = [
+            part
+            for part in parts
+            if isinstance(part, RandomTransform) and part.generator is None
+        ]
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
         super().__init__(
             storage=storage,
             sample_unit=goal,
@@ -152,6 +153,27 @@ class CAIACReplayBuffer(TensorDictReplayBuffer):
             generator=generator,
             **kwargs,
         )
+
+    def set_rng(self, generator: torch.Generator | None) -> None:
+        """Sets the source of randomness of rows, goals and augmentation.
+
+        Args:
+            generator (torch.Generator, optional): ``None`` for torch's default one.
+                Transforms that were made with a generator of their own keep it.
+        """
+        super().set_rng(generator)
+        self._generator = generator
+        for part in self._drawing:
+            part.set_generator(generator)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The generator is sent by this class: TorchRL would send its state in a tensor,
+        # which a process that is spawned cannot open, and not to the transforms.
+        return without_generator(super().__getstate__())
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        super().set_rng(self._generator)
 
     def score(self, estimator: Any, **kwargs: Any) -> None:
         """Scores the rows, in the process that contains the buffer.
