@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import threading
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import LazyMemmapStorage
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.caiac_buffer import CAIACReplayBuffer
@@ -56,13 +57,14 @@ def transitions(first: float, rows: int = 20) -> TensorDict:
 
 
 def make(**kwargs: Any) -> CAIACReplayBuffer:
-    settings: dict[str, Any] = {
+    settings = {
         "augmentation": partial(CAIACTransform, LAYOUT, 0.5, 0.0),
         "goals": partial(HindsightGoal, LAYOUT, reward, future=1.0),
         "batch_size": 64,
         **kwargs,
     }
-    rb = CAIACReplayBuffer(partial(LazyMemmapStorage, 20), shared=True, **settings)
+    settings.setdefault("shared", not settings.get("prefetch"))
+    rb = CAIACReplayBuffer(partial(LazyMemmapStorage, 20), **settings)
     rb.extend(transitions(0.0))
     rb.sample()  # builds the indices here
     return rb
@@ -132,8 +134,11 @@ def in_process(method: str, *jobs: Callable[[], Any]) -> list[Any]:
     answers = context.Queue()
     process = context.Process(target=work, args=(answers, list(jobs)))
     process.start()
-    found = [answers.get(timeout=120) for _ in jobs]
-    process.join()
+    try:
+        found = [answers.get(timeout=120) for _ in jobs]
+    finally:
+        process.kill()
+        process.join()
     for answer in found:
         if isinstance(answer, BaseException):
             raise answer
@@ -169,6 +174,39 @@ def test_forked_processes_with_the_same_numbers_are_warned_of() -> None:
     )
     assert seeded[0] != again[0]
     assert not seeded[1]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_threads_of_a_buffer_are_those_of_its_process(method: str) -> None:
+    rb = make(prefetch=2)
+    with pytest.raises(RuntimeError, match="leave out prefetch"):
+        in_process(method, partial(sampled, rb, 0))
+    assert_right("goals", rb.sample(), 0.0)
+
+
+def test_a_forked_process_does_not_wait_for_threads_of_its_parent() -> None:
+    building = CAIACReplayBuffer(
+        partial(LazyTensorStorage, 10**5), augmentation=AHEAD, batch_size=4
+    )
+    building.extend(transitions(0.0, 10**5))
+    settings = {**BUFFERS["lookahead"], "donors": "self"}
+    rb = make(**settings)
+    ended = threading.Event()
+
+    def build() -> None:
+        while not ended.is_set():
+            building.storage.set(0, building.storage[0])
+            building.sample()
+
+    thread = threading.Thread(target=build)
+    thread.start()
+    try:
+        for _ in range(10):
+            in_process("fork", partial(extended, rb, "lookahead"))
+            rb.extend(transitions(0.0))
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_a_loaded_state_goes_on_as_the_saved_one() -> None:

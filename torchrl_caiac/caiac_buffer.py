@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,10 @@ __all__ = ["CAIACReplayBuffer"]
 Donors = str | Path | Callable[[], ReplayBuffer | TensorStorage]
 
 _OWN = "self"
+_ALONE = (
+    "a buffer with prefetch draws batches in threads, which belong to the process that "
+    "made it: leave out prefetch, or make the buffer in the process that samples"
+)
 _TAKEN = ("storage", "transform", "transform_factory", "sample_unit", "generator")
 
 
@@ -140,6 +146,7 @@ class CAIACReplayBuffer(TensorDictReplayBuffer):
         parts += [
             _made(f"transforms[{i}]", f, Transform) for i, f in enumerate(transforms)
         ]
+        self._pid, self._prefetches = os.getpid(), bool(kwargs.get("prefetch"))
         self._drawing = [
             part
             for part in parts
@@ -166,13 +173,26 @@ class CAIACReplayBuffer(TensorDictReplayBuffer):
         for part in self._drawing:
             part.set_generator(generator)
 
+    def sample(self, *args: Any, **kwargs: Any) -> Any:
+        """Samples a batch, see :meth:`torchrl.data.TensorDictReplayBuffer.sample`.
+
+        Raises:
+            RuntimeError: the buffer has ``prefetch``, and this process was forked.
+        """
+        if self._pid != os.getpid() and self._prefetches:
+            raise RuntimeError(_ALONE)
+        return super().sample(*args, **kwargs)
+
     def __getstate__(self) -> dict[str, Any]:
+        if self._prefetches and get_spawning_popen() is not None:
+            raise RuntimeError(_ALONE)
         # The generator is sent by this class: TorchRL would send its state in a tensor,
         # which a process that is spawned cannot open, and not to the transforms.
         return without_generator(super().__getstate__())
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
+        self._pid = os.getpid()
         super().set_rng(self._generator)
 
     def score(self, estimator: Any, **kwargs: Any) -> None:

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, StorageEnsemble, TensorStorage
 
 from torchrl_caiac._fingerprints import fingerprint_key
+from torchrl_caiac._processes import ThreadLock
 from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
@@ -40,7 +41,7 @@ NEVER = 2**31 - 1
 # Scores that are compared with the threshold together.
 _CHUNK = 1 << 20
 # Batches may be prefetched by several threads. It is taken before the buffer's lock.
-_BUILDING = threading.RLock()
+_BUILDING = ThreadLock()
 
 
 def check_lookahead(lookahead: object) -> LookaheadArgument:
