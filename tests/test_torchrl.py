@@ -251,6 +251,16 @@ def test_prefetched_batches_are_dropped(rb):
     assert (rb.sample()["a"] == 9).all()
 
 
+def test_the_state_of_a_buffer_without_its_generator():
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(4), generator=torch.Generator().manual_seed(0)
+    )
+    rb.extend(rows(3))
+    copy = ReplayBuffer.__new__(ReplayBuffer)
+    copy.__setstate__(fence.without_generator(rb.__getstate__()))
+    assert fence.without_generator(copy.__getstate__()) == copy.__getstate__()
+
+
 def test_writes_of_other_threads_wait():
     rb = ReplayBuffer(storage=LazyTensorStorage(4))
     with ThreadPoolExecutor() as pool:

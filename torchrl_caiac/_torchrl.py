@@ -51,6 +51,7 @@ __all__ = [
     "storage_rows",
     "tensor_version",
     "vmap_loss",
+    "without_generator",
     "writes_paused",
 ]
 
@@ -333,6 +334,11 @@ def drop_prefetched(rb: ReplayBuffer) -> None:
     """Discards the batches that a buffer has prefetched."""
     with rb._futures_lock:
         rb._clear_prefetch_queue_locked()
+
+
+def without_generator(state: dict[str, Any]) -> dict[str, Any]:
+    """Returns the state with which a buffer is pickled, without its generator."""
+    return {**state, "_rng": None}
 
 
 def set_online_buffer(mixed: OfflineToOnlineReplayBuffer, online: ReplayBuffer) -> None:
