@@ -485,10 +485,10 @@ class CounterfactualTransform(RandomTransform, ABC):
             if checked.unscored is not None:
                 if self._unscored.device != scores.device:
                     self._unscored = self._unscored.to(scores.device)
-                self._unscored += checked.unscored
+                self._unscored.add_(checked.unscored)
         if self._no_donor.device != draw.no_donor.device:
             self._no_donor = self._no_donor.to(draw.no_donor.device)
-        self._no_donor += draw.no_donor
+        self._no_donor.add_(draw.no_donor)
         return out if len(shape) == 1 else out.reshape(shape)
 
     def _locked(

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import path
+from torchrl_caiac._torchrl import with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_window
@@ -275,23 +276,24 @@ class WindowGoal(FutureGoal):
                 "the batch already contains counterfactuals, whose goals would not "
                 "follow the swap: append WindowGoal before the augmentation"
             )
-        out = tensordict.copy()
+        leaves: dict[NestedKey, torch.Tensor] = {}
         for key, goal in goals.items():
-            if goal.shape[0] * self.window != out.shape[0]:
+            if goal.shape[0] * self.window != tensordict.shape[0]:
                 raise RuntimeError(
                     f"goals were drawn for {goal.shape[0]} windows of {self.window} "
-                    f"rows, but the batch has {out.shape[0]} rows: append WindowGoal "
-                    "first, before transforms that change the batch size"
+                    f"rows, but the batch has {tensordict.shape[0]} rows: append "
+                    "WindowGoal first, before transforms that change the batch size"
                 )
-            rows = goal if out.device is None else goal.to(out.device)
+            device = tensordict.device
+            rows = goal if device is None else goal.to(device)
             if self.window > 1:
                 rows = rows.unsqueeze(1).expand(-1, self.window, *goal.shape[1:])
                 rows = rows.flatten(0, 1)
-            out.set(key, rows)
+            leaves[key] = rows
             after = self.layout.next(key)
-            if out.get(after, None) is not None:
-                out.set(after, rows)
-        return out
+            if tensordict.get(after, None) is not None:
+                leaves[after] = rows
+        return with_leaves(tensordict, leaves)
 
     def extra_repr(self) -> str:
         """Returns the arguments, for ``repr``."""
