@@ -305,6 +305,7 @@ def apply_swap(
     *,
     window: int = 1,
     sources: Sequence[torch.Tensor] | None = None,
+    has_own: bool = False,
     trajectories: TrajectoryIndex | None = None,
     goals: Callable[[SwapLeaf], torch.Tensor] | None = None,
 ) -> TensorDictBase:
@@ -323,6 +324,8 @@ def apply_swap(
         window (int): rows in a window. Defaults to 1.
         sources (sequence of torch.Tensor, optional): for each leaf of the plan what
             ``draw.donors`` are rows of, ``[T, ...]``; by default the batch itself.
+        has_own (bool): whether ``sources`` begin with the last ``C`` windows of the
+            batch. Defaults to ``False``.
         trajectories (TrajectoryIndex, optional): which row follows which in
             ``sources``; by default the next one.
         goals (callable, optional): reads the desired goals ``[C, ...]`` of a leaf from
@@ -360,6 +363,8 @@ def apply_swap(
     if sources is None:
         starts = window_starts(len(td) // window, window, draw.swapped.device)
         own = starts[-changed:].unsqueeze(-1)
+    elif has_own:
+        own = window_starts(changed, window, draw.swapped.device).unsqueeze(-1)
     else:
         own = draw.donors.new_zeros(changed, 1)
     # Where nothing is swapped, a row of the batch is its own donor.
@@ -374,15 +379,16 @@ def apply_swap(
     leaves: dict[NestedKey, torch.Tensor] = {}
     for number, leaf in enumerate(plan.leaves):
         value = values[leaf.place]
+        is_complete = sources is None or has_own
         if goals is not None and leaf.is_desired:
-            new = goals(leaf).unsqueeze(1)
+            new, is_complete = goals(leaf).unsqueeze(1), False
         else:
             source = value if sources is None else sources[number]
             if leaf.group not in places:
                 found = _places(rows, leaf, window, len(source))
                 places[leaf.group] = found.to(source.device)
             new = _read(source, places[leaf.group], leaf)
-        if sources is not None:
+        if not is_complete:
             kind = leaf.group, value.ndim
             if kind not in masks:
                 masks[kind] = _mask(draw.swapped, leaf, value.ndim, plan.has_rest)

@@ -285,7 +285,7 @@ class HindsightGoal(FutureGoal):
             if self.random > 0:
                 later = torch.where(is_future, later, goal)
             goal = torch.where(flags, goal, later)
-        share = self.future + self.random
+        share: Any = self.future + self.random
         if self.counterfactual != share:
             share = torch.where(flags, self.counterfactual, share)
         source = torch.where(chance < share, goal, own)
