@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
 from tensordict import TensorClass, TensorDict, lazy_stack
 from torchrl.data import (
     ImmutableDatasetWriter,
@@ -366,13 +365,17 @@ def test_vmap_over_the_parameters_of_networks():
     torch.testing.assert_close(found, torch.stack([net(x) for net in networks]))
 
 
-@pytest.mark.parametrize("relu", [False, True])
-def test_linear_pointwise_is_a_linear_layer(relu):
-    x, weight, bias = torch.randn(5, 8), torch.randn(4, 8), torch.randn(4)
-    wanted = F.linear(x, weight, bias)
-    wanted = wanted.relu() if relu else wanted
-    for w in (weight, fence.packed_weight(weight)):
-        torch.testing.assert_close(fence.linear_pointwise(x, w, bias, relu), wanted)
+def test_transformed_tensors_are_told_apart():
+    seen = []
+
+    def look(x):
+        seen.append(fence.is_transformed(x))
+        return x.sum()
+
+    look(torch.ones(2))
+    torch.vmap(look)(torch.ones(2, 2))
+    torch.func.grad(look)(torch.ones(2))
+    assert seen == [False, True, True]
 
 
 def test_versions_count_writes():

@@ -34,12 +34,11 @@ __all__ = [
     "forget_leaves",
     "is_in_another_process",
     "is_in_order_of_time",
+    "is_transformed",
     "last_written",
-    "linear_pointwise",
     "loss_masks",
     "mark_memmap",
     "memmap_folder",
-    "packed_weight",
     "priority_weight",
     "reduce_loss",
     "sampled_rows",
@@ -484,30 +483,13 @@ def vmap_loss(*args: Any, **kwargs: Any) -> Any:
     return _vmap_func(*args, **kwargs)
 
 
-# --- products on CPUs ----------------------------------------------------------------
-
-
-def linear_pointwise(
-    value: Tensor, weight: Tensor, bias: Tensor | None, relu: bool
-) -> Tensor:
-    """Applies oneDNN's linear layer, ``[B, I]`` to ``[B, O]``, in float32 on a CPU.
-
-    ``torch.compile`` replaces ``F.linear`` by the same operator.
-    """
-    after = "relu" if relu else "none"
-    product: Tensor = torch.ops.mkldnn._linear_pointwise(
-        value, weight, bias, after, [], ""
-    )
-    return product
-
-
-def packed_weight(weight: Tensor) -> Tensor:
-    """Returns a weight ``[O, I]`` in oneDNN's fastest layout, for inference."""
-    packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight)
-    return packed
-
-
 # --- tensors -------------------------------------------------------------------------
+
+
+def is_transformed(tensor: Tensor) -> bool:
+    """Returns whether a tensor is one of :func:`torch.vmap` or :mod:`torch.func`."""
+    found: bool = torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    return found
 
 
 def tensor_version(tensor: Tensor) -> tuple[int, int] | None:
