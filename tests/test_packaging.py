@@ -128,6 +128,15 @@ def test_all_extra_names_every_other_extra_but_the_peers() -> None:
     assert named == set(extras) - {"all", "bench"}
 
 
+def test_every_supported_python_is_tested() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = [text.rsplit(" ", 1)[1] for text in project["classifiers"]]
+    workflow = yaml.safe_load((ROOT / ".github/workflows/tests.yml").read_text())
+    tested = workflow["jobs"]["tests"]["strategy"]["matrix"]["python"]
+    assert tested == [version for version in named if version.startswith("3.")]
+    assert project["requires-python"] == f">={tested[0]}"
+
+
 def test_package_is_typed() -> None:
     assert (Path(torchrl_caiac.__file__).parent / "py.typed").is_file()
 
