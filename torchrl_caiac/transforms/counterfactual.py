@@ -69,8 +69,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             ``"last"``.
         swap_prob (float): probability of swapping what may be swapped.
         window (int): rows in a window, κ.
-        lookahead (int or str, optional): how far ahead influence counts: steps, or
-            ``"next"``.
+        lookahead (int or str, optional): how far ahead influence counts: steps,
+            ``"next"`` or ``"goal"``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
         score_key (NestedKey): the scores.
         unscored (str): what happens to rows without valid scores: ``"raise"`` or
@@ -132,6 +132,12 @@ class CounterfactualTransform(RandomTransform, ABC):
             self._check_goals(goals, donors)
         self.lookahead = check_lookahead(lookahead)
         self._lookahead: Lookahead | None = None
+        if self.lookahead == "goal" and donors is not None:
+            raise ValueError(
+                "lookahead='goal' compares influence with the goals that rows of the "
+                "batch have, but donors is a buffer, whose rows have none: leave out "
+                "donors, to draw them from the batch, or use lookahead='next'"
+            )
         if self.lookahead is not None:
             self._lookahead = Lookahead(
                 self.lookahead,

@@ -112,7 +112,7 @@ class WindowGoal(FutureGoal):
                 f"{dict(mixture)}"
             )
         self.mixture = dict(mixture)
-        self.out_keys = self.goal_keys
+        self.out_keys = [*self.goal_keys, self.keys.goal_steps]
 
     def _reset_state(self) -> None:
         super()._reset_state()
@@ -185,7 +185,10 @@ class WindowGoal(FutureGoal):
         offset = draw_goal_offset(
             remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
         )
-        self.keep_goals(self.read_goals(data, trajectories.later(last, offset)))
+        goals = self.read_goals(data, trajectories.later(last, offset))
+        # Of the first row of each window.
+        steps = offset.to(last.device).unsqueeze(-1) + (self.window - 1)
+        self.keep_goals({**goals, self.keys.goal_steps: steps})
         return index, info
 
     def _check_windows(
@@ -254,7 +257,7 @@ class WindowGoal(FutureGoal):
 
         Returns:
             TensorDictBase: a shallow copy with desired goals, also under ``next``
-            where the batch has them there.
+            where the batch has them there, and the steps from each row to its goal.
 
         Raises:
             RuntimeError: no goals were drawn for this batch, or it was augmented
@@ -287,6 +290,10 @@ class WindowGoal(FutureGoal):
             if self.window > 1:
                 rows = rows.unsqueeze(1).expand(-1, self.window, *goal.shape[1:])
                 rows = rows.flatten(0, 1)
+            if key == self.keys.goal_steps:
+                passed = torch.arange(len(rows), device=rows.device) % self.window
+                out.set(key, rows - passed.unsqueeze(-1))
+                continue
             out.set(key, rows)
             after = self.layout.next(key)
             if out.get(after, None) is not None:
