@@ -18,6 +18,7 @@ from torchrl_caiac._torchrl import sampled_rows, sampling_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import (
+    check_batch_shape,
     check_choice,
     check_generator,
     check_layout,
@@ -463,7 +464,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         self._check_buffer(tensordict)
         shape = tensordict.batch_size
         if len(shape) != 1:
-            self._check_shape(tensordict)
+            check_batch_shape(tensordict, self.window)
             tensordict = tensordict.reshape(-1)
         scores = self._scores(tensordict)
         if not self._thresholds.is_known:
@@ -530,27 +531,6 @@ class CounterfactualTransform(RandomTransform, ABC):
                 f"counterfactual: pass rows='last' to {type(self).__name__}, and a "
                 "her_ratio of at most 1 - counterfactual_ratio = "
                 f"{1 - self.counterfactual_ratio:g}"
-            )
-
-    def _check_shape(self, td: TensorDictBase) -> None:
-        sizes = list(td.batch_size)
-        if not sizes:
-            raise ValueError(
-                "the batch has shape [], a single transition: give a batch [B], "
-                "such as the one that a buffer samples, or td.unsqueeze(0)"
-            )
-        while len(sizes) > 1 and sizes[-1] == 1:  # of slices in an ensemble
-            sizes.pop()
-        if not td.numel():
-            raise ValueError(
-                f"the batch has shape {list(td.shape)}, which has no rows: sample "
-                "from a buffer that is not empty"
-            )
-        if sizes[-1] % self.window:
-            raise ValueError(
-                f"the batch has shape {list(td.shape)}, whose last dimension is not a "
-                f"multiple of the window {self.window}: sample whole windows from each "
-                "buffer"
             )
 
     def _scores(self, td: TensorDictBase) -> torch.Tensor:
