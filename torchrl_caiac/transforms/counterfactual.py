@@ -24,7 +24,7 @@ from torchrl_caiac.transforms.checks import (
     check_number,
     check_window,
 )
-from torchrl_caiac.transforms.donors import BufferDonors
+from torchrl_caiac.transforms.donors import BufferDonors, RowsRead
 from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
 from torchrl_caiac.transforms.free_share import FreeShare
 from torchrl_caiac.transforms.goals.window import WindowGoal
@@ -69,8 +69,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             ``"last"``.
         swap_prob (float): probability of swapping what may be swapped.
         window (int): rows in a window, κ.
-        lookahead (int or str, optional): how far ahead influence counts: steps, or
-            ``"next"``.
+        lookahead (int or str, optional): how far ahead influence counts: steps,
+            ``"next"`` or ``"goal"``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
         score_key (NestedKey): the scores.
         unscored (str): what happens to rows without valid scores: ``"raise"`` or
@@ -132,6 +132,12 @@ class CounterfactualTransform(RandomTransform, ABC):
             self._check_goals(goals, donors)
         self.lookahead = check_lookahead(lookahead)
         self._lookahead: Lookahead | None = None
+        if self.lookahead == "goal" and donors is not None:
+            raise ValueError(
+                "lookahead='goal' compares influence with the goals that rows of the "
+                "batch have, but donors is a buffer, whose rows have none: leave out "
+                "donors, to draw them from the batch, or use lookahead='next'"
+            )
         if self.lookahead is not None:
             self._lookahead = Lookahead(
                 self.lookahead,
@@ -400,9 +406,10 @@ class CounterfactualTransform(RandomTransform, ABC):
         plan: SwapPlan,
         values: Sequence[torch.Tensor],
         draw: SwapDraw,
+        read: RowsRead | None = None,
     ) -> TensorDictBase:
         if self._donors:
-            out = self._donors[0].apply(td, plan, values, draw)
+            out = self._donors[0].apply(td, plan, values, draw, read)
         else:
             out = apply_swap(td, plan, values, draw, window=self.window)
         keys, swapped = self.keys, draw.swapped
@@ -477,18 +484,19 @@ class CounterfactualTransform(RandomTransform, ABC):
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)
         draw = self._draw(scores)
+        read = None
         if self.check and self._donors:
-            draw = self._donors[0].verified(draw)
-        out = self._swap(tensordict, plan, values, draw)
+            draw, read = self._donors[0].verified(draw)
+        out = self._swap(tensordict, plan, values, draw, read)
         if checked is not None:
             self._batch_check.after(out, checked, plan.states)
             if checked.unscored is not None:
                 if self._unscored.device != scores.device:
                     self._unscored = self._unscored.to(scores.device)
-                self._unscored += checked.unscored
+                self._unscored.add_(checked.unscored)
         if self._no_donor.device != draw.no_donor.device:
             self._no_donor = self._no_donor.to(draw.no_donor.device)
-        self._no_donor += draw.no_donor
+        self._no_donor.add_(draw.no_donor)
         return out if len(shape) == 1 else out.reshape(shape)
 
     def _locked(
