@@ -9,7 +9,12 @@ from typing import Any, ClassVar, Literal, TypeVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import HERReplayBuffer, ReplayBuffer, TensorStorage
+from torchrl.data import (
+    HERReplayBuffer,
+    ReplayBuffer,
+    ReplayBufferEnsemble,
+    TensorStorage,
+)
 
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._fingerprints import fingerprint_key
@@ -553,10 +558,12 @@ class CounterfactualTransform(RandomTransform, ABC):
         scores = td.get(self.score_key, None)
         if scores is None:
             donors = self.donors_class
+            where = "on the replay buffer"
+            if isinstance(sampling_buffer(), ReplayBufferEnsemble):
+                where = "on each buffer of the ensemble"
             raise KeyError(
                 f"the batch has no {donors.scores_name} in {self.score_key!r}: call "
-                "score_buffer on the replay buffer, or name their key with "
-                f"{donors.key_argument}"
+                f"score_buffer {where}, or name their key with {donors.key_argument}"
             )
         expected = (td.shape[0], *self.feature_shape)
         if tuple(scores.shape) != expected:
