@@ -21,7 +21,7 @@ from torchrl_caiac._torchrl import is_transformed
 __all__ = ["faster_dtype", "inference_linear", "linear"]
 
 # Multiply-adds below which the overhead of a call outweighs the faster kernel.
-_SMALL = 2**20
+_SMALL = 2**21
 # Rows from which on the fastest kernel stays the same.
 _ALIKE = 1024
 
@@ -49,8 +49,10 @@ def linear(value: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> T
         tensor([[0.],
                 [0.]])
     """
-    if value.numel() * len(weight) < _SMALL or not _has_choice(value, weight, bias):
-        return _plain(value, weight, bias, relu)
+    # The first condition is cheap, since it delays every small product.
+    if value.numel() * weight.shape[0] < _SMALL or not _has_choice(value, weight, bias):
+        out = F.linear(value, weight, bias)
+        return out.relu_() if relu else out
     rows = value if value.ndim == 2 else value.reshape(-1, value.shape[-1])
     has_grad = torch.is_grad_enabled()
     product = _Product.of(
@@ -89,7 +91,7 @@ def inference_linear(
         tensor([3.])
     """
     is_onednn = False
-    if rows * weight.numel() >= _SMALL and _has_choice(weight, bias):
+    if rows * weight.numel() >= _SMALL and _has_choice(weight, weight, bias):
         product = _Product.of(rows, weight, "dense", relu)
         is_onednn = known_kernel(product, product.name, product.others) == "onednn"
 
@@ -252,15 +254,17 @@ def _step(
     return call
 
 
-def _has_choice(*operands: Tensor) -> bool:
+def _has_choice(value: Tensor, weight: Tensor, bias: Tensor) -> bool:
     """Returns whether another kernel than torch's may be faster."""
     return (
         # First: the compiler chooses its own kernels, and cannot trace the others.
         not torch.compiler.is_compiling()
-        and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in operands)
+        and value.dtype is torch.float32
+        and value.device.type == "cpu"
         and onednn_has_float32()
         and not torch.is_autocast_enabled("cpu")
-        and not any(is_transformed(x) for x in operands)
+        and not (is_transformed(value) or is_transformed(weight))
+        and not is_transformed(bias)
     )
 
 
