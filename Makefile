@@ -14,7 +14,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo fetch-push reproduce figures watch influence thresholds bench docs clean
+.PHONY: help setup test lint demo fetch-push reproduce figures watch online influence thresholds bench docs clean
 
 # A stamp without its interpreter (moved folder, removed Python) does not count.
 ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
@@ -75,6 +75,10 @@ figures: setup ## draw the results of all studies again
 
 watch: setup ## film two agents of a study side by side (STUDY=demo)
 	@$(BIN)/python examples/watch.py study=$(or $(STUDY),demo) $(SIZE)
+
+online: setup ## train offline, then collect and train in turn (QUICK=1)
+	@$(BIN)/python examples/online.py $(if $(QUICK),size=quick online.rounds=1 \
+	    online.episodes=2 online.steps=4)
 
 influence: setup ## compare influence estimators (QUICK=1: a smoke run)
 	@for env in fetch_push kitchen kitchen_all_tasks; do \

@@ -36,6 +36,30 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("shared")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts tests with Ray last, since others fork, which its threads do not stand."""
+    items.sort(key=lambda item: "cluster" in getattr(item, "fixturenames", ()))
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[None]:
+    """Ray on this machine, with two workers that import this working tree."""
+    import ray
+
+    os.environ["RAY_ENABLE_UINT_METRICS"] = "0"
+    variables = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+    ray.init(
+        num_cpus=2,
+        include_dashboard=False,
+        object_store_memory=200 << 20,
+        log_to_driver=False,
+        configure_logging=False,
+        runtime_env={"env_vars": variables},
+    )
+    yield
+    ray.shutdown()
+
+
 @pytest.fixture(autouse=True)
 def cuda(request: pytest.FixtureRequest) -> Iterator[None]:
     """A stand-in for the device of tests marked ``gpu`` where there is none."""

@@ -366,15 +366,6 @@ def test_table_of_subpackages() -> None:
         assert not set(named) - set(public), places
 
 
-def test_citation_has_the_version() -> None:
-    def versions(name: str, pattern: str) -> list[str]:
-        return re.findall(pattern, (ROOT / name).read_text(), flags=re.MULTILINE)
-
-    cited = versions("CITATION.cff", r"^version: (\S+)$")
-    assert cited == versions("pyproject.toml", r'^version = "(\S+)"$')
-    assert len(cited) == 1
-
-
 @pytest.mark.gpu
 @in_memory
 def test_on_a_gpu(flat_data: TensorDictBase) -> None:

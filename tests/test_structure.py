@@ -17,6 +17,7 @@ LAYERS = [
         "_checks",
         "_column_motion",
         "_columns",
+        "_extras",
         "_figures",
         "_files",
         "_fingerprints",

@@ -8,12 +8,12 @@ and that no other module uses such a name.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict._utils_key_json import _encode_key_for_filesystem
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -50,6 +50,8 @@ __all__ = [
     "storage_rows",
     "tensor_version",
     "vmap_loss",
+    "with_leaves",
+    "without_generator",
     "writes_paused",
 ]
 
@@ -334,9 +336,74 @@ def drop_prefetched(rb: ReplayBuffer) -> None:
         rb._clear_prefetch_queue_locked()
 
 
+def without_generator(state: dict[str, Any]) -> dict[str, Any]:
+    """Returns the state with which a buffer is pickled, without its generator."""
+    return {**state, "_rng": None}
+
+
 def set_online_buffer(mixed: OfflineToOnlineReplayBuffer, online: ReplayBuffer) -> None:
     """Replaces the online buffer, which the constructor makes of a storage only."""
     mixed._online_buffer = online
+
+
+# --- batches -------------------------------------------------------------------------
+
+
+def with_leaves(
+    td: TensorDictBase, leaves: Mapping[NestedKey, Tensor]
+) -> TensorDictBase:
+    """Returns a shallow copy of a tensordict with other leaves.
+
+    The same as ``copy`` and ``set``, in a third of the time.
+
+    Args:
+        td (TensorDictBase): the tensordict, ``[*B]``; it is not changed.
+        leaves (mapping of NestedKey to torch.Tensor): the leaves, ``[*B, ...]``.
+
+    Returns:
+        TensorDictBase: the copy.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._torchrl import with_leaves
+        >>> td = TensorDict({"a": torch.zeros(2), "b": {"c": torch.zeros(2)}}, [2])
+        >>> with_leaves(td, {("b", "c"): torch.ones(2)})["b", "c"]
+        tensor([1., 1.])
+    """
+    out = _shallow(td)
+    shape, device = td.batch_size, td.device
+    for key, leaf in leaves.items():
+        *parents, name = (key,) if isinstance(key, str) else key
+        node = out
+        for parent in parents:
+            node = node._tensordict.get(parent) if type(node) is TensorDict else None
+        if (
+            type(node) is TensorDict
+            and leaf.shape[: len(shape)] == shape == node.batch_size
+            and (device is None or leaf.device == device)
+        ):
+            node._tensordict[name] = leaf
+        else:
+            out.set(key, leaf)
+    return out
+
+
+def _shallow(td: Any) -> Any:
+    if type(td) is not TensorDict:
+        return td.copy()
+    entries = {
+        name: entry
+        if isinstance(entry, Tensor) or not is_tensor_collection(entry)
+        else _shallow(entry)
+        for name, entry in td._tensordict.items()
+    }
+    return TensorDict._new_unsafe(
+        entries,
+        batch_size=td.batch_size,
+        device=td.device,
+        names=td._maybe_names(),
+    )
 
 
 # --- memory-mapped tensordicts -------------------------------------------------------

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac._figures import (
     GREY,
     NUM_COLOURS,
@@ -67,7 +68,8 @@ def bootstrap_interval(
         >>> 0 <= low < 0.75 < high <= 1
         True
     """
-    from scipy.stats import bootstrap
+    with extra("report", "bootstrap_interval"):
+        from scipy.stats import bootstrap
 
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac._files import UnreadableFileError, whole_folder
 from torchrl_caiac.data.collect import collection_folder
 from torchrl_caiac.data.minari_checks import check_metadata
@@ -46,7 +47,8 @@ def dataset_path(dataset_id: str, root: str | os.PathLike[str] | None = None) ->
     if root is not None:
         # Minari does not support relative paths.
         return Path(root).absolute() / dataset_id
-    from minari.storage import get_dataset_path
+    with extra("envs", dataset_id):
+        from minari.storage import get_dataset_path
 
     return Path(get_dataset_path(dataset_id)).absolute()
 
@@ -117,7 +119,8 @@ def open_minari(
         ...
         FileNotFoundError: no Minari dataset 'push/play-v0' in ...
     """
-    import minari
+    with extra("envs", dataset_id):
+        import minari
 
     data = dataset_path(dataset_id, root) / "data"
     if not data.exists() and download:

@@ -123,6 +123,9 @@ def score_shard(
         )
     parts = ScoreParts.of(own.folder, own.key)
     joined = False
+    record = own.read_record()
+    if record is None or record["state"] != "scored":
+        own.scorer.block(0)  # all compile what they need at once, not within the lock
     with parts.taking_part():
         with parts.leading():
             plan = _begin(own, parts, shard[1], overwrite=overwrite)

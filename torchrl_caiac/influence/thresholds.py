@@ -142,12 +142,7 @@ class ThresholdSuggestions:
                 "the distributions of the scores are not known: call "
                 "suggest_thresholds(...) and plot what it returns"
             )
-        try:
-            figure = new_figure(7.0, 1.7 * len(self._histograms) + 0.4)
-        except ImportError as error:
-            raise ImportError(
-                "figures need matplotlib: pip install 'torchrl-caiac[report]'"
-            ) from error
+        figure = new_figure(7.0, 1.7 * len(self._histograms) + 0.4)
         axes = figure.subplots(len(self._histograms), 1, squeeze=False)[:, 0]
         for panel, (name, found) in zip(axes, self._histograms.items(), strict=True):
             width = np.diff(found.edges)
@@ -438,7 +433,7 @@ def _usable(
             layout.in_keys,
             [layout.next(entry) for entry in layout.in_keys],
             layout.names,
-            rows,
+            lambda leaf: leaf.index_select(0, rows),
         )
     if not bool(used.any()):
         raise ValueError(

@@ -13,6 +13,8 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, StorageEnsemble, TensorStorage
 
 from torchrl_caiac._fingerprints import fingerprint_key
+from torchrl_caiac._keys import get_leaf
+from torchrl_caiac._processes import ThreadLock
 from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
@@ -32,15 +34,18 @@ __all__ = [
     "steps_to_influence",
 ]
 
-LookaheadArgument = int | Literal["next"] | None
+LookaheadArgument = int | Literal["next", "goal"] | None
 
 #: The number of steps of an entity that is not influenced any more in its trajectory.
 NEVER = 2**31 - 1
 
+# The most steps that a table has; NEVER is one more.
+_MOST = torch.iinfo(torch.int16).max - 1
+
 # Scores that are compared with the threshold together.
 _CHUNK = 1 << 20
 # Batches may be prefetched by several threads. It is taken before the buffer's lock.
-_BUILDING = threading.RLock()
+_BUILDING = ThreadLock()
 
 
 def check_lookahead(lookahead: object) -> LookaheadArgument:
@@ -53,7 +58,7 @@ def check_lookahead(lookahead: object) -> LookaheadArgument:
         int, str or None: the lookahead.
 
     Raises:
-        TypeError: it is neither an int, ``"next"`` nor ``None``.
+        TypeError: it is neither an int, ``"next"``, ``"goal"`` nor ``None``.
         ValueError: it is negative.
 
     Examples:
@@ -63,11 +68,12 @@ def check_lookahead(lookahead: object) -> LookaheadArgument:
     """
     if lookahead is None:
         return None
-    if isinstance(lookahead, str) and lookahead == "next":
-        return "next"
+    if isinstance(lookahead, str) and lookahead in ("next", "goal"):
+        return lookahead  # type: ignore[return-value]
     if isinstance(lookahead, bool) or not isinstance(lookahead, int):
         raise TypeError(
-            f"lookahead must be a number of steps, 'next' or None, got {lookahead!r}"
+            "lookahead must be a number of steps, 'next', 'goal' or None, got "
+            f"{lookahead!r}"
         )
     if lookahead < 0:
         raise ValueError(f"lookahead is {lookahead}, expected at least 0")
@@ -124,14 +130,18 @@ def _steps(influenced: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
 
 
 def locked_entities(
-    steps: torch.Tensor, rule: int | Literal["next"], competing: torch.Tensor
+    steps: torch.Tensor,
+    rule: int | Literal["next"] | torch.Tensor,
+    competing: torch.Tensor,
 ) -> torch.Tensor:
     """Returns the entities that must stay, since the action is meant for them.
 
     Args:
         steps (torch.Tensor): from :func:`steps_to_influence`, ``[T, N]``.
-        rule (int or str): a number of steps: what is influenced within it. ``"next"``:
-            what is influenced now, or else what is influenced next.
+        rule (int, str or torch.Tensor): a number of steps: what is influenced within
+            it. ``"next"``: what is influenced now, or else what is influenced next. The
+            steps to the goal of each row, ``[T, 1]``: that, and what is influenced
+            before the goal.
         competing (torch.Tensor): bool ``[N]``, the entities that can be the next one.
 
     Returns:
@@ -150,10 +160,14 @@ def locked_entities(
                 [ True, False],
                 [False, False]])
     """
-    if rule != "next":
+    if isinstance(rule, int):
         return steps <= rule
-    first = steps.where(competing, NEVER).amin(-1, keepdim=True)
-    return (steps == 0) | ((steps == first) & (first < NEVER))
+    never = min(NEVER, torch.iinfo(steps.dtype).max)
+    first = steps.where(competing, never).amin(-1, keepdim=True)
+    locked = (steps == 0) | ((steps == first) & (first < never))
+    if isinstance(rule, torch.Tensor):
+        locked |= steps <= rule.clamp(max=never - 1)
+    return locked
 
 
 def hold_entities(scores: torch.Tensor, locked: torch.Tensor) -> torch.Tensor:
@@ -186,12 +200,13 @@ def hold_entities(scores: torch.Tensor, locked: torch.Tensor) -> torch.Tensor:
 class Lookahead:
     """The entities that stored rows lock, computed when their buffer is first sampled.
 
-    The table has one byte for each row and entity. It is built again after each write
-    to the storage. A row whose score is missing, or that of another state, counts as
-    influenced.
+    The table has one byte for each row and entity, or two with the rule ``"goal"``. It
+    is built again after each write to the storage. A row whose score is missing, or
+    that of another state, counts as influenced.
 
     Args:
-        rule (int or str): see :func:`locked_entities`.
+        rule (int or str): see :func:`locked_entities`; with ``"goal"`` batches have the
+            steps to their goals.
         layout (EntityLayout): the entities.
 
     Keyword Args:
@@ -204,7 +219,7 @@ class Lookahead:
 
     def __init__(
         self,
-        rule: int | Literal["next"],
+        rule: int | Literal["next", "goal"],
         layout: EntityLayout,
         *,
         score_key: NestedKey,
@@ -212,7 +227,7 @@ class Lookahead:
         free: Callable[[torch.Tensor], torch.Tensor],
         competing: Callable[[], torch.Tensor],
     ) -> None:
-        self.rule: int | Literal["next"] = rule
+        self.rule: int | Literal["next", "goal"] = rule
         self.layout = layout
         self.score_key = score_key
         self.keys = keys
@@ -234,7 +249,8 @@ class Lookahead:
             source (ReplayBuffer or TensorStorage): the buffer, or its storage.
 
         Returns:
-            torch.Tensor: bool ``[T, N]``.
+            torch.Tensor: bool ``[T, N]``; with the rule ``"goal"`` the steps to the
+            next influence, int16 ``[T, N]``.
 
         Raises:
             KeyError: the scores, or trajectory ids and end flags, are missing.
@@ -266,7 +282,7 @@ class Lookahead:
         scores = valid_scores(data, self.score_key, self.layout, len(storage))
         record = read_record(storage, data, self.score_key)
         own = 0 if record is None else int(record["settings"]["lookahead"])
-        if self.rule != "next" and self.rule < own:
+        if isinstance(self.rule, int) and self.rule < own:
             raise ValueError(
                 f"lookahead is {self.rule}, but the scores in {self.score_key!r} "
                 f"contain those of {own} later states: pass at least lookahead={own}, "
@@ -275,9 +291,10 @@ class Lookahead:
         trajectories = trajectory_index(
             source, trajectory_key=self.keys.trajectory, done_key=self.keys.done
         )
-        competing = self._competing().to(scores.device)
+        competing = self._competes = self._competing().to(scores.device)
+        dtype = torch.int16 if self.rule == "goal" else torch.bool
         table = torch.empty(
-            len(scores), len(self.layout), dtype=torch.bool, device=scores.device
+            len(scores), len(self.layout), dtype=dtype, device=scores.device
         )
         # Whole trajectories at a time, on which no others depend.
         size = max(1, _CHUNK // scores[0].numel())
@@ -293,7 +310,11 @@ class Lookahead:
             influenced = torch.cat([~self._free(scores[part]) for part in parts])
             steps = _steps(influenced, left)
             steps += own * ((steps > 0) & (steps < NEVER))
-            table[rows] = locked_entities(steps, self.rule, competing)
+            if self.rule == "goal":
+                steps = steps.clamp(max=_MOST).where(steps < NEVER, _MOST + 1)
+                table[rows] = steps.to(dtype)
+            else:
+                table[rows] = locked_entities(steps, self.rule, competing)
             start = stop
         return table
 
@@ -318,6 +339,7 @@ class Lookahead:
             ``None``.
 
         Raises:
+            KeyError: the batch lacks the steps to its goals, with the rule ``"goal"``.
             RuntimeError: the batch does not consist of these rows, or those of several
                 buffers; or its scores or trajectory ids were changed.
         """
@@ -359,6 +381,16 @@ class Lookahead:
                     "those of the storage: append this transform before those that "
                     "change them in place, or leave out lookahead"
                 )
+        if self.rule == "goal":
+            goal_steps = get_leaf(
+                batch,
+                self.keys.goal_steps,
+                "lookahead='goal' needs the steps to the goal of each row, but the "
+                "batch lacks",
+                "append WindowGoal before this transform, or use lookahead='next'",
+            )
+            competing = self._competes.to(device)
+            found = locked_entities(found, goal_steps, competing)
         return found | replaced.unsqueeze(-1), differs if late else None
 
     def __getstate__(self) -> dict[str, Any]:
