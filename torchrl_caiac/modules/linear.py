@@ -16,7 +16,7 @@ from torchrl_caiac._kernels import (
     onednn_has_float32,
     through_onednn,
 )
-from torchrl_caiac._torchrl import is_transformed
+from torchrl_caiac._torchrl import is_transformed, packed_linear
 
 __all__ = ["faster_dtype", "inference_linear", "linear"]
 
@@ -92,16 +92,11 @@ def inference_linear(
     """
     is_onednn = False
     if rows * weight.numel() >= _SMALL and _has_choice(weight, weight, bias):
-        product = _Product.of(rows, weight, "dense", relu)
+        product = _Product.of(rows, weight, "packed", relu)
         is_onednn = known_kernel(product, product.name, product.others) == "onednn"
-
-    def apply(value: Tensor) -> Tensor:
-        if not is_onednn:
-            return _plain(value, weight, bias, relu)
-        with through_onednn():
-            return _plain(value, weight, bias, relu)
-
-    return apply
+    if is_onednn:
+        return packed_linear(weight, bias, relu)
+    return partial(_plain, weight=weight, bias=bias, relu=relu)
 
 
 def faster_dtype(rows: int, width: int) -> torch.dtype:
@@ -146,7 +141,8 @@ class _Product(NamedTuple):
         rows (int): the number of rows, rounded down to a power of two.
         outputs (int): the number of outputs.
         inputs (int): the number of inputs.
-        layout (str): how the rows lie in memory, see :func:`_layout`.
+        layout (str): how the rows lie in memory, see :func:`_layout`; or ``"packed"``
+            for dense rows and a weight in oneDNN's layout.
         relu (bool): whether the positive part is taken.
         of_value (bool): whether there is a gradient of the input.
         of_weight (bool): whether there is one of weight and bias.
@@ -192,6 +188,12 @@ class _Product(NamedTuple):
     def others(self) -> dict[str, Callable[[], Any]]:
         """Returns calls that compute such a product, and its gradients."""
         operands = _operands(self.rows, self.inputs, self.outputs, self.layout)
+        value, weight, bias = operands
+        if self.layout == "packed":
+            return {
+                "plain": partial(_plain, *operands, self.relu),
+                "onednn": partial(packed_linear(weight, bias, self.relu), value),
+            }
         needed = (self.of_value, self.of_weight)
         return {
             "plain": _step(partial(_plain, relu=self.relu), operands, needed),
@@ -222,7 +224,7 @@ def _operands(
 
     if layout == "transposed":
         value = draw(inputs, rows).t()
-    elif layout == "dense":
+    elif layout in ("dense", "packed"):
         value = draw(rows, inputs)
     else:
         value = draw(rows, 2 * inputs)
