@@ -365,6 +365,14 @@ def test_vmap_over_the_parameters_of_networks():
     torch.testing.assert_close(found, torch.stack([net(x) for net in networks]))
 
 
+@pytest.mark.parametrize("relu", [False, True])
+def test_packed_linear_is_a_linear_layer(relu):
+    x, weight, bias = torch.randn(3, 5, 8), torch.randn(4, 8), torch.randn(4)
+    wanted = torch.nn.functional.linear(x, weight, bias)
+    wanted = wanted.relu() if relu else wanted
+    torch.testing.assert_close(fence.packed_linear(weight, bias, relu)(x), wanted)
+
+
 def test_transformed_tensors_are_told_apart():
     seen = []
 

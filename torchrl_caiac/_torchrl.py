@@ -8,7 +8,7 @@ and that no other module uses such a name.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -39,6 +39,7 @@ __all__ = [
     "loss_masks",
     "mark_memmap",
     "memmap_folder",
+    "packed_linear",
     "priority_weight",
     "reduce_loss",
     "sampled_rows",
@@ -484,6 +485,25 @@ def vmap_loss(*args: Any, **kwargs: Any) -> Any:
 
 
 # --- tensors -------------------------------------------------------------------------
+
+
+def packed_linear(
+    weight: Tensor, bias: Tensor, relu: bool
+) -> Callable[[Tensor], Tensor]:
+    """Returns oneDNN's linear layer, ``[*B, I]`` to ``[*B, O]``, in float32 on a CPU.
+
+    The weight is copied to the fastest layout. There are no gradients.
+    """
+    packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach())
+    after = "relu" if relu else "none"
+
+    def apply(value: Tensor) -> Tensor:
+        out: Tensor = torch.ops.mkldnn._linear_pointwise(
+            value, packed, bias, after, [], ""
+        )
+        return out
+
+    return apply
 
 
 def is_transformed(tensor: Tensor) -> bool:
