@@ -22,7 +22,7 @@ from tensordict import (
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join
-from torchrl_caiac._torchrl import with_leaves
+from torchrl_caiac._torchrl import leaf_of, with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.transforms.draws import SwapDraw
@@ -126,7 +126,7 @@ class SwapPlanner:
             ValueError: a leaf has the wrong width.
             TypeError: an entity contains something other than tensors.
         """
-        found: list[Any] = [td.get(source.key, None) for source in self._sources]
+        found: list[Any] = [leaf_of(td, source.key) for source in self._sources]
         keys: list[tuple[NestedKey, _Source]] = []
         if self.layout.is_flat:
             signature: Hashable = tuple(map(_signature, found))
