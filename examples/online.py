@@ -7,9 +7,10 @@ of offline and online transitions. ``online.episodes=0`` collects nothing, for
 comparison. The policies before the first and after the last round play from the test
 starts. ``size=quick`` is a smoke run, with ``online.rounds=2`` and the like.
 
-The table is ``<publish>/online.csv``, the figure ``online.png`` beside it. Rounds that are finished are not repeated: a run
-resumes at the last one, with the episodes that it has collected. Workers draw their own
-noise, so a resumed run does not end with the same weights.
+The table is ``<publish>/online.csv``, the figure ``online.png`` beside it. Rounds that
+are finished are not repeated: a run resumes at the last one, with the episodes that it
+has collected. Workers draw their own noise, so a resumed run does not end with the same
+weights.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.pretend_cuda import nothing_waits
-from torchrl_caiac._random import draw_numbers
+from torchrl_caiac._random import draw_below, draw_numbers
 
 KINDS: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]] = [
     (torch.rand, ((2, 3),), {"dtype": torch.float64}),
@@ -27,6 +27,23 @@ def test_numbers_are_those_of_the_generator(kind, args, kwargs):
         )
         torch.manual_seed(0)
         torch.testing.assert_close(found, kind(*args, **kwargs))
+
+
+def test_numbers_below_limits_have_equal_chances():
+    limit = torch.tensor([[3], [1], [0], [-1]]).expand(4, 30_000)
+    found = draw_below(limit, generator=torch.Generator().manual_seed(0))
+    counts = found[0].bincount()
+    assert len(counts) == 3 and (counts - 10_000).abs().max() < 5 * 82
+    assert not found[1:].any() and found.dtype == torch.int64
+
+
+def test_the_largest_share_is_below_the_limit(monkeypatch):
+    largest = 1 - 2.0**-53
+    monkeypatch.setattr(
+        torch, "rand", lambda size, dtype, **_: torch.full(size, largest, dtype=dtype)
+    )
+    limits = torch.tensor([1, 2, 3, 5, 512, 1000, 3 * 2**40, 2**48 - 1, 2**48])
+    assert torch.equal(draw_below(limits), limits - 1)
 
 
 @pytest.mark.gpu

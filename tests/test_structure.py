@@ -21,6 +21,7 @@ LAYERS = [
         "_figures",
         "_files",
         "_fingerprints",
+        "_kernels",
         "_keys",
         "_processes",
         "_random",

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
-from tensordict import TensorDict
+from tensordict import TensorClass, TensorDict, lazy_stack
 from torchrl.data import (
     ImmutableDatasetWriter,
     LazyMemmapStorage,
@@ -244,11 +243,54 @@ def test_a_transform_finds_the_rows_of_its_batch():
     assert sampled_rows() is None
 
 
+class Pose(TensorClass):
+    x: torch.Tensor
+
+
+@pytest.mark.parametrize("device", [None, "cpu"])
+@pytest.mark.parametrize("kind", ["plain", "names", "lazy stack", "parts"])
+def test_with_leaves_is_a_copy_with_leaves(kind, device):
+    td = TensorDict({"a": torch.zeros(2), "next": {"a": torch.zeros(2)}}, [2], device)
+    td.set_non_tensor("name", "kitchen")
+    if kind == "names":
+        td.names = ["time"]
+    elif kind == "lazy stack":
+        td = lazy_stack(list(td.unbind(0)))
+    elif kind == "parts":
+        td["pose"] = Pose(x=torch.zeros(2), batch_size=[2])
+        td["stack"] = lazy_stack([TensorDict({"a": torch.zeros(())})] * 2)
+        td["lone"] = TensorDict({"a": torch.zeros(2)})
+    td.lock_()
+    keys = ["a", ("next", "a"), ("next", "b"), ("new", "b"), ("pose", "x")]
+    leaves = {key: torch.ones(2) for key in [*keys, ("stack", "a")]}
+    wanted, before = td.copy(), td.clone()
+    for key, leaf in leaves.items():
+        wanted.set(key, leaf)
+    out = fence.with_leaves(td, leaves)
+    assert set(out.keys(True, True)) == set(wanted.keys(True, True))
+    assert (out == wanted).all() and (td == before).all()
+    assert type(out) is type(wanted) and out.names == wanted.names
+    assert out.device == wanted.device and not out.is_locked
+    assert all(out.get(key) is leaves[key] for key in keys if kind == "plain")
+    with pytest.raises(RuntimeError, match="batch dimension"):
+        fence.with_leaves(td, {("next", "a"): torch.ones(3)})
+
+
 def test_prefetched_batches_are_dropped(rb):
     rb.sample()  # samples the next ones ahead
     fence.storage_data(rb.storage)["a"].fill_(9)
     fence.drop_prefetched(rb)
     assert (rb.sample()["a"] == 9).all()
+
+
+def test_the_state_of_a_buffer_without_its_generator():
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(4), generator=torch.Generator().manual_seed(0)
+    )
+    rb.extend(rows(3))
+    copy = ReplayBuffer.__new__(ReplayBuffer)
+    copy.__setstate__(fence.without_generator(rb.__getstate__()))
+    assert fence.without_generator(copy.__getstate__()) == copy.__getstate__()
 
 
 def test_writes_of_other_threads_wait():
@@ -323,13 +365,17 @@ def test_vmap_over_the_parameters_of_networks():
     torch.testing.assert_close(found, torch.stack([net(x) for net in networks]))
 
 
-@pytest.mark.parametrize("relu", [False, True])
-def test_linear_pointwise_is_a_linear_layer(relu):
-    x, weight, bias = torch.randn(5, 8), torch.randn(4, 8), torch.randn(4)
-    wanted = F.linear(x, weight, bias)
-    wanted = wanted.relu() if relu else wanted
-    for w in (weight, fence.packed_weight(weight)):
-        torch.testing.assert_close(fence.linear_pointwise(x, w, bias, relu), wanted)
+def test_transformed_tensors_are_told_apart():
+    seen = []
+
+    def look(x):
+        seen.append(fence.is_transformed(x))
+        return x.sum()
+
+    look(torch.ones(2))
+    torch.vmap(look)(torch.ones(2, 2))
+    torch.func.grad(look)(torch.ones(2))
+    assert seen == [False, True, True]
 
 
 def test_versions_count_writes():

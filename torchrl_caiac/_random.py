@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-__all__ = ["draw_integers", "draw_numbers"]
+__all__ = ["draw_below", "draw_integers", "draw_numbers"]
 
 _RANDOM_BITS = 1 << 62
 
@@ -80,3 +80,35 @@ def draw_integers(
     return draw_numbers(
         torch.randint, _RANDOM_BITS, shape, device=device, generator=generator
     )
+
+
+def draw_below(
+    limit: torch.Tensor, *, generator: torch.Generator | None = None
+) -> torch.Tensor:
+    """Draws random integers below limits, each with practically the same probability.
+
+    Args:
+        limit (torch.Tensor): int64 ``[*]``, from -1 to ``2**48``.
+
+    Keyword Args:
+        generator (torch.Generator, optional): the generator. Defaults to ``None``: the
+            global one of the limits' device.
+
+    Returns:
+        torch.Tensor: int64 ``[*]``, from 0 to ``limit - 1``; 0 where the limit is 0 or
+        -1.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac._random import draw_below
+        >>> draw_below(torch.tensor([1, 0]))
+        tensor([0, 0])
+    """
+    share = draw_numbers(
+        torch.rand,
+        limit.shape,
+        device=limit.device,
+        generator=generator,
+        dtype=torch.float64,
+    )
+    return (share * limit).long()

@@ -8,12 +8,12 @@ and that no other module uses such a name.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict._utils_key_json import _encode_key_for_filesystem
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -34,12 +34,11 @@ __all__ = [
     "forget_leaves",
     "is_in_another_process",
     "is_in_order_of_time",
+    "is_transformed",
     "last_written",
-    "linear_pointwise",
     "loss_masks",
     "mark_memmap",
     "memmap_folder",
-    "packed_weight",
     "priority_weight",
     "reduce_loss",
     "sampled_rows",
@@ -51,6 +50,8 @@ __all__ = [
     "storage_rows",
     "tensor_version",
     "vmap_loss",
+    "with_leaves",
+    "without_generator",
     "writes_paused",
 ]
 
@@ -335,9 +336,74 @@ def drop_prefetched(rb: ReplayBuffer) -> None:
         rb._clear_prefetch_queue_locked()
 
 
+def without_generator(state: dict[str, Any]) -> dict[str, Any]:
+    """Returns the state with which a buffer is pickled, without its generator."""
+    return {**state, "_rng": None}
+
+
 def set_online_buffer(mixed: OfflineToOnlineReplayBuffer, online: ReplayBuffer) -> None:
     """Replaces the online buffer, which the constructor makes of a storage only."""
     mixed._online_buffer = online
+
+
+# --- batches -------------------------------------------------------------------------
+
+
+def with_leaves(
+    td: TensorDictBase, leaves: Mapping[NestedKey, Tensor]
+) -> TensorDictBase:
+    """Returns a shallow copy of a tensordict with other leaves.
+
+    The same as ``copy`` and ``set``, in a third of the time.
+
+    Args:
+        td (TensorDictBase): the tensordict, ``[*B]``; it is not changed.
+        leaves (mapping of NestedKey to torch.Tensor): the leaves, ``[*B, ...]``.
+
+    Returns:
+        TensorDictBase: the copy.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._torchrl import with_leaves
+        >>> td = TensorDict({"a": torch.zeros(2), "b": {"c": torch.zeros(2)}}, [2])
+        >>> with_leaves(td, {("b", "c"): torch.ones(2)})["b", "c"]
+        tensor([1., 1.])
+    """
+    out = _shallow(td)
+    shape, device = td.batch_size, td.device
+    for key, leaf in leaves.items():
+        *parents, name = (key,) if isinstance(key, str) else key
+        node = out
+        for parent in parents:
+            node = node._tensordict.get(parent) if type(node) is TensorDict else None
+        if (
+            type(node) is TensorDict
+            and leaf.shape[: len(shape)] == shape == node.batch_size
+            and (device is None or leaf.device == device)
+        ):
+            node._tensordict[name] = leaf
+        else:
+            out.set(key, leaf)
+    return out
+
+
+def _shallow(td: Any) -> Any:
+    if type(td) is not TensorDict:
+        return td.copy()
+    entries = {
+        name: entry
+        if isinstance(entry, Tensor) or not is_tensor_collection(entry)
+        else _shallow(entry)
+        for name, entry in td._tensordict.items()
+    }
+    return TensorDict._new_unsafe(
+        entries,
+        batch_size=td.batch_size,
+        device=td.device,
+        names=td._maybe_names(),
+    )
 
 
 # --- memory-mapped tensordicts -------------------------------------------------------
@@ -417,30 +483,13 @@ def vmap_loss(*args: Any, **kwargs: Any) -> Any:
     return _vmap_func(*args, **kwargs)
 
 
-# --- products on CPUs ----------------------------------------------------------------
-
-
-def linear_pointwise(
-    value: Tensor, weight: Tensor, bias: Tensor | None, relu: bool
-) -> Tensor:
-    """Applies oneDNN's linear layer, ``[B, I]`` to ``[B, O]``, in float32 on a CPU.
-
-    ``torch.compile`` replaces ``F.linear`` by the same operator.
-    """
-    after = "relu" if relu else "none"
-    product: Tensor = torch.ops.mkldnn._linear_pointwise(
-        value, weight, bias, after, [], ""
-    )
-    return product
-
-
-def packed_weight(weight: Tensor) -> Tensor:
-    """Returns a weight ``[O, I]`` in oneDNN's fastest layout, for inference."""
-    packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight)
-    return packed
-
-
 # --- tensors -------------------------------------------------------------------------
+
+
+def is_transformed(tensor: Tensor) -> bool:
+    """Returns whether a tensor is one of :func:`torch.vmap` or :mod:`torch.func`."""
+    found: bool = torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    return found
 
 
 def tensor_version(tensor: Tensor) -> tuple[int, int] | None:

@@ -113,7 +113,7 @@ class TrajectoryIndex(NamedTuple):
 
         The number of steps must be at most :meth:`remaining`.
         """
-        if self.order is None:
+        if self.order is None and self.oldest:
             return (rows + steps) % self.length
         return self.rows((self.position(rows) + steps).clamp_max(self.length - 1))
 

@@ -329,11 +329,11 @@ def test_donor_windows_and_their_goals_in_any_order(
         goals=goals,
         generator=torch.Generator().manual_seed(0),
     )
-    batch = small(layout, window=window, batch=60).sample()
+    batch = small(layout, window=window, batch=240).sample()
     out = transform(batch)
     assert out["caiac", "swapped"][:, 1:].all()
     cup = out["observation"][:, 5] if layout is FLAT else out["state", "cup", "pos"]
-    names = (cup.reshape(60, window, -1)[..., 0] // STRIDE).long()
+    names = (cup.reshape(240, window, -1)[..., 0] // STRIDE).long()
     # Whole windows of one trajectory in the order of time, all of them.
     steps = names[:, :1] + torch.arange(window)
     assert torch.equal(names, steps)

@@ -286,7 +286,10 @@ class BatchCheck:
         if not pairs or LateCheck.needed(pairs[0][0].device):
             return None
         for here, there in pairs:
-            if here.shape != there.shape or not torch.equal(
+            if (here.shape, here.dtype) != (there.shape, there.dtype):
+                return None
+            here, there = _wide(here), _wide(there)
+            if not torch.equal(
                 here.unflatten(0, (-1, window))[:, 1:],
                 there.unflatten(0, (-1, window))[:, :-1],
             ):
@@ -368,6 +371,14 @@ class BatchCheck:
                     f"values, first in row {row} of the batch: clean the data, or "
                     "the donors' data"
                 )
+
+
+def _wide(leaf: torch.Tensor) -> torch.Tensor:
+    """Returns a leaf ``[B, ...]`` whose values are pairs, which are compared faster."""
+    is_pairs = leaf.dtype is torch.float32 and leaf.ndim > 1 and not leaf.shape[-1] % 2
+    if is_pairs and leaf.is_contiguous() and not leaf.storage_offset() % 2:
+        return leaf.view(torch.int64)
+    return leaf
 
 
 @lru_cache(maxsize=16)

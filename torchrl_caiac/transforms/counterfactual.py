@@ -18,13 +18,14 @@ from torchrl_caiac._torchrl import sampled_rows, sampling_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import (
+    check_batch_shape,
     check_choice,
     check_generator,
     check_layout,
     check_number,
     check_window,
 )
-from torchrl_caiac.transforms.donors import BufferDonors
+from torchrl_caiac.transforms.donors import BufferDonors, RowsRead
 from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
 from torchrl_caiac.transforms.free_share import FreeShare
 from torchrl_caiac.transforms.goals.window import WindowGoal
@@ -406,9 +407,10 @@ class CounterfactualTransform(RandomTransform, ABC):
         plan: SwapPlan,
         values: Sequence[torch.Tensor],
         draw: SwapDraw,
+        read: RowsRead | None = None,
     ) -> TensorDictBase:
         if self._donors:
-            out = self._donors[0].apply(td, plan, values, draw)
+            out = self._donors[0].apply(td, plan, values, draw, read)
         else:
             out = apply_swap(td, plan, values, draw, window=self.window)
         keys, swapped = self.keys, draw.swapped
@@ -462,7 +464,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         self._check_buffer(tensordict)
         shape = tensordict.batch_size
         if len(shape) != 1:
-            self._check_shape(tensordict)
+            check_batch_shape(tensordict, self.window)
             tensordict = tensordict.reshape(-1)
         scores = self._scores(tensordict)
         if not self._thresholds.is_known:
@@ -483,18 +485,19 @@ class CounterfactualTransform(RandomTransform, ABC):
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)
         draw = self._draw(scores)
+        read = None
         if self.check and self._donors:
-            draw = self._donors[0].verified(draw)
-        out = self._swap(tensordict, plan, values, draw)
+            draw, read = self._donors[0].verified(draw)
+        out = self._swap(tensordict, plan, values, draw, read)
         if checked is not None:
             self._batch_check.after(out, checked, plan.states)
             if checked.unscored is not None:
                 if self._unscored.device != scores.device:
                     self._unscored = self._unscored.to(scores.device)
-                self._unscored += checked.unscored
+                self._unscored.add_(checked.unscored)
         if self._no_donor.device != draw.no_donor.device:
             self._no_donor = self._no_donor.to(draw.no_donor.device)
-        self._no_donor += draw.no_donor
+        self._no_donor.add_(draw.no_donor)
         return out if len(shape) == 1 else out.reshape(shape)
 
     def _locked(
@@ -528,27 +531,6 @@ class CounterfactualTransform(RandomTransform, ABC):
                 f"counterfactual: pass rows='last' to {type(self).__name__}, and a "
                 "her_ratio of at most 1 - counterfactual_ratio = "
                 f"{1 - self.counterfactual_ratio:g}"
-            )
-
-    def _check_shape(self, td: TensorDictBase) -> None:
-        sizes = list(td.batch_size)
-        if not sizes:
-            raise ValueError(
-                "the batch has shape [], a single transition: give a batch [B], "
-                "such as the one that a buffer samples, or td.unsqueeze(0)"
-            )
-        while len(sizes) > 1 and sizes[-1] == 1:  # of slices in an ensemble
-            sizes.pop()
-        if not td.numel():
-            raise ValueError(
-                f"the batch has shape {list(td.shape)}, which has no rows: sample "
-                "from a buffer that is not empty"
-            )
-        if sizes[-1] % self.window:
-            raise ValueError(
-                f"the batch has shape {list(td.shape)}, whose last dimension is not a "
-                f"multiple of the window {self.window}: sample whole windows from each "
-                "buffer"
             )
 
     def _scores(self, td: TensorDictBase) -> torch.Tensor:

@@ -32,7 +32,7 @@ from torchrl_caiac.transforms.thresholds import EntityThresholds
 if TYPE_CHECKING:
     from torchrl_caiac.transforms.goals.window import WindowGoal
 
-__all__ = ["BufferDonors", "eligible_starts", "scan_donors"]
+__all__ = ["BufferDonors", "RowsRead", "eligible_starts", "scan_donors"]
 
 # Rows of the storage that are read together while an index is built.
 _CHUNK = 1 << 17
@@ -150,6 +150,32 @@ def eligible_starts(
                 words[entity].index_add_(0, word, value)
     found = DonorBits.of_words(words)
     return found if int(found.size.sum()) > _MOST_LISTED else found.listed()
+
+
+class RowsRead:
+    """Rows of a storage, of which each leaf is read once.
+
+    Args:
+        rows (torch.Tensor): int64 ``[M]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.donors import RowsRead
+        >>> RowsRead(torch.tensor([2, 0]))(torch.tensor([5, 6, 7]))
+        tensor([7, 5])
+    """
+
+    def __init__(self, rows: torch.Tensor) -> None:
+        self.rows = rows
+        self._read: dict[Any, torch.Tensor] = {}
+
+    def __call__(self, leaf: torch.Tensor) -> torch.Tensor:
+        """Returns the rows of a leaf ``[T, ...]``, ``[M, ...]``."""
+        key = leaf.data_ptr(), leaf.dtype, leaf.shape, leaf.stride()
+        found = self._read.get(key)
+        if found is None:
+            found = self._read[key] = leaf.index_select(0, self.rows)
+        return found
 
 
 class BufferDonors:
@@ -313,7 +339,7 @@ class BufferDonors:
         rows = self.goals.draw_rows(last, trajectories, generator=generator)
         return draw._replace(goal_rows=rows)
 
-    def verified(self, draw: SwapDraw) -> SwapDraw:
+    def verified(self, draw: SwapDraw) -> tuple[SwapDraw, RowsRead | None]:
         """Takes back swaps whose donors were written to after they were scored.
 
         The index of donors is built again after each write that the storage notices. It
@@ -325,39 +351,41 @@ class BufferDonors:
             draw (SwapDraw): from :meth:`draw`.
 
         Returns:
-            SwapDraw: the draw, without these swaps, which count as having no donor.
+            tuple: the draw, without these swaps, which count as having no donor; and
+            what was read of the donors, if :meth:`apply` can use it.
         """
         _, trajectories, data = self.index()
         known = data.get(fingerprint_key(self.score_key), None)
         if known is None or {known.device.type, draw.swapped.device.type} != {"cpu"}:
-            return draw
-        place = draw.swapped.nonzero()
+            return draw, None
         rows = draw.donors[draw.swapped]
         if not len(rows):
-            return draw
+            return draw, None
         every = rows
         if self.window > 1 and trajectories is not None:
             every = torch.cat([rows, trajectories.later(rows, self.window - 1)])
         layout = self.layout
+        read = RowsRead(every)
         is_valid = matches(
             data,
             plain_tensor(known),
             layout.in_keys,
             [layout.next(key) for key in layout.in_keys],
             layout.names,
-            every,
+            read,
         )
         if bool(is_valid.all()):
-            return draw
+            return draw, read if self.window == 1 else None
         self.refresh()
         is_valid = is_valid.view(-1, len(rows)).all(0)
-        lost = place[~is_valid]
+        lost = draw.swapped.nonzero()[~is_valid]
         taken_back = torch.zeros_like(draw.swapped)
         taken_back[lost[:, 0], lost[:, 1]] = True
-        return draw._replace(
+        draw = draw._replace(
             swapped=draw.swapped & ~taken_back,
             no_donor=draw.no_donor + taken_back.sum(0),
         )
+        return draw, None
 
     def apply(
         self,
@@ -365,29 +393,52 @@ class BufferDonors:
         plan: SwapPlan,
         values: Sequence[torch.Tensor],
         draw: SwapDraw,
+        read: RowsRead | None = None,
     ) -> TensorDictBase:
-        """Applies what :meth:`draw` returned, see :func:`apply_swap`."""
+        """Applies what :meth:`draw` returned, see :func:`apply_swap`.
+
+        Args:
+            td (TensorDictBase): the batch, ``[B * window]``.
+            plan (SwapPlan): its plan.
+            values (sequence of torch.Tensor): its leaves.
+            draw (SwapDraw): the draw.
+            read (RowsRead, optional): what :meth:`verified` read.
+
+        Returns:
+            TensorDictBase: a shallow copy with new leaves.
+        """
         _, trajectories, data = self.index()
         if not len(draw.swapped):
             return td.copy()
-        read = self._read
-        if read is None or read[0] is not plan or read[1] is not data:
-            self._read = read = plan, data, self._sources(data, plan, values)
-        goals = self.goals
+        known = self._read
+        if known is None or known[0] is not plan or known[1] is not data:
+            self._read = known = plan, data, self._sources(data, plan, values)
+        sources, goals = known[2], self.goals
 
         def donor_goals(leaf: SwapLeaf) -> torch.Tensor:
             assert goals is not None and draw.goal_rows is not None
             return goals.donor_goals(data, draw.goal_rows, leaf.owner, leaf.key)
 
         is_in_order = trajectories is None or trajectories.is_storage_order
+        if read is not None:  # behind the rows of the batch, in the order of the swaps
+            count = len(draw.swapped)
+            place = draw.swapped.flatten().cumsum(0).view(draw.swapped.shape)
+            draw = draw._replace(donors=place + (count - 1))
+            sources = [
+                source
+                if goals is not None and leaf.is_desired
+                else torch.cat([values[leaf.place][-count:], read(source)])
+                for leaf, source in zip(plan.leaves, sources, strict=True)
+            ]
         return apply_swap(
             td,
             plan,
             values,
             draw,
             window=self.window,
-            sources=read[2],
-            trajectories=None if is_in_order else trajectories,
+            sources=sources,
+            has_own=read is not None,
+            trajectories=None if is_in_order or read is not None else trajectories,
             goals=None if goals is None else donor_goals,
         )
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import torch
 
-from torchrl_caiac._random import draw_integers, draw_numbers
+from torchrl_caiac._random import draw_below, draw_numbers
 from torchrl_caiac.transforms.indexing import pick_rows, window_max, window_starts
 
 __all__ = [
@@ -218,8 +218,9 @@ def _drawn(
     chosen: torch.Tensor | None,
     generator: torch.Generator | None,
 ) -> torch.Tensor:
+    """Returns which of the free entities are swapped, bool ``[N, C]``."""
     if chosen is not None:
-        free = free & chosen.unsqueeze(-1)
+        free = free & chosen
     if swap_prob >= 1.0:
         return free
     chance = draw_numbers(
@@ -268,25 +269,22 @@ def draw_batch_donors(
     """
     count, entities = free.shape
     first = count - num_windows
-    is_chosen = _drawn(free[first:], swap_prob, chosen, generator).t()
     free = free.t()
-    # rank[n, b]: the number of free windows of entity n up to and including window b.
-    rank = free.cumsum(1)
-    total, own = rank[:, -1:], rank[:, first:]
-    # At least two, of which a remainder can be taken: with fewer there is no donor.
-    size = total.clamp_min(2)
-    pick = draw_integers(own.shape, device=free.device, generator=generator)
-    # Cyclic over the free windows, from the one after the entity's own to the one
-    # before.
-    place = (pick % (size - 1) + own) % size
-    # listed[n, r]: the free window of rank r, from 1; those that are not free end up
-    # at 0.
+    tail = free[:, first:] if first else free
+    is_chosen = _drawn(tail, swap_prob, chosen, generator)
+    # rank[n, b]: the number of free windows of entity n before window b, if that is
+    # free; last[n]: the rank of its last one, and so the number of donors.
+    rank = free.cumsum(1).sub_(1)
+    last, own = rank[:, -1:], rank[:, first:] if first else rank
+    place = draw_below(last.expand_as(own), generator=generator)
+    place = place + (place >= own)  # not the window itself
+    # listed[n, r]: the free window of rank r; the others end up in the last place.
     starts = window_starts(count, window, free.device).expand(entities, -1)
-    listed = rank.new_zeros(entities, count + 2)
-    listed.scatter_(1, rank * free, starts)
-    swapped = is_chosen & (total > 1)
+    listed = rank.new_zeros(entities, count + 1)
+    listed.scatter_(1, torch.where(free, rank, count), starts)
+    swapped = is_chosen & (last > 0)
     return SwapDraw(
-        listed[:, 1:].gather(1, place).t(),
+        listed.gather(1, place).t(),
         swapped.t(),
         (is_chosen ^ swapped).sum(1),
         chosen=chosen,
@@ -326,10 +324,10 @@ def draw_buffer_donors(
         tensor([[ True, False]])
     """
     device = free.device
-    is_chosen = _drawn(free, swap_prob, chosen, generator)
+    is_chosen = _drawn(free.t(), swap_prob, chosen, generator).t()
     size = index.size.to(device)
-    pick = draw_integers(free.shape, device=device, generator=generator)
-    pick = pick % size.clamp_min(1) + index.offset.to(device)
+    pick = draw_below(size.expand_as(free), generator=generator)
+    pick = pick + index.offset.to(device)
     found = size > 0
     swapped = is_chosen & found
     home = index.offset.device

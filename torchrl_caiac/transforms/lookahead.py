@@ -14,6 +14,7 @@ from torchrl.data import ReplayBuffer, StorageEnsemble, TensorStorage
 
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._keys import get_leaf
+from torchrl_caiac._processes import ThreadLock
 from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
@@ -44,7 +45,7 @@ _MOST = torch.iinfo(torch.int16).max - 1
 # Scores that are compared with the threshold together.
 _CHUNK = 1 << 20
 # Batches may be prefetched by several threads. It is taken before the buffer's lock.
-_BUILDING = threading.RLock()
+_BUILDING = ThreadLock()
 
 
 def check_lookahead(lookahead: object) -> LookaheadArgument:

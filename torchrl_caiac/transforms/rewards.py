@@ -286,8 +286,12 @@ class GoalLeaves:
         if not reward.is_floating_point():
             return
         flat = reward.detach().reshape(-1)
+        is_late = LateCheck.needed(flat.device)
+        # A sum is finite if all its terms are.
+        if not is_late and math.isfinite(flat.sum().item()):
+            return
         flat = flat if where is None else flat.where(where, torch.zeros_like(flat))
-        if not LateCheck.needed(flat.device):
+        if not is_late:
             bad = ~flat.isfinite()
             if not bool(bad.any()):
                 return

@@ -22,6 +22,7 @@ from tensordict import (
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join
+from torchrl_caiac._torchrl import with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.transforms.draws import SwapDraw
@@ -60,10 +61,12 @@ class SwapPlan(NamedTuple):
         leaves (tuple of SwapLeaf): what follows a swap.
         states (tuple of NestedKey): the floating-point leaves of states and next
             states, those of fixed entities included.
+        has_rest (bool): whether there are columns that no entity owns.
     """
 
     leaves: tuple[SwapLeaf, ...]
     states: tuple[NestedKey, ...]
+    has_rest: bool
 
 
 class _Source(NamedTuple):
@@ -188,7 +191,9 @@ class SwapPlanner:
             for source, value in zip(self._sources, found, strict=True)
             if source.kind == "state" and value.is_floating_point()
         ]
-        return SwapPlan(tuple(leaves), tuple(states))
+        rest = len(layout)
+        has_rest = any(bool((owner == rest).any()) for _, owner in owners.values())
+        return SwapPlan(tuple(leaves), tuple(states), has_rest)
 
     def _plan(
         self,
@@ -214,7 +219,7 @@ class SwapPlanner:
                 )
             if source.is_required and value.is_floating_point():
                 states.append(key)
-        return SwapPlan(tuple(leaves), tuple(states))
+        return SwapPlan(tuple(leaves), tuple(states), False)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_plans": {}}
@@ -300,6 +305,7 @@ def apply_swap(
     *,
     window: int = 1,
     sources: Sequence[torch.Tensor] | None = None,
+    has_own: bool = False,
     trajectories: TrajectoryIndex | None = None,
     goals: Callable[[SwapLeaf], torch.Tensor] | None = None,
 ) -> TensorDictBase:
@@ -318,6 +324,8 @@ def apply_swap(
         window (int): rows in a window. Defaults to 1.
         sources (sequence of torch.Tensor, optional): for each leaf of the plan what
             ``draw.donors`` are rows of, ``[T, ...]``; by default the batch itself.
+        has_own (bool): whether ``sources`` begin with the last ``C`` windows of the
+            batch. Defaults to ``False``.
         trajectories (TrajectoryIndex, optional): which row follows which in
             ``sources``; by default the next one.
         goals (callable, optional): reads the desired goals ``[C, ...]`` of a leaf from
@@ -348,43 +356,47 @@ def apply_swap(
                 [2., 1.]]), tensor([[10., 11.],
                 [12., 11.]]))
     """
-    out = td.copy()
     changed = draw.swapped.shape[0]
     if not changed:
-        return out
+        return td.copy()
     first = td.shape[0] - changed * window
     if sources is None:
         starts = window_starts(len(td) // window, window, draw.swapped.device)
         own = starts[-changed:].unsqueeze(-1)
+    elif has_own:
+        own = window_starts(changed, window, draw.swapped.device).unsqueeze(-1)
     else:
         own = draw.donors.new_zeros(changed, 1)
-    # Where nothing is swapped, a row of the batch is its own donor; one more entity,
-    # which is never swapped, owns the columns that no entity owns.
-    rows = torch.cat([torch.where(draw.swapped, draw.donors, own), own], -1)
+    # Where nothing is swapped, a row of the batch is its own donor.
+    rows = torch.where(draw.swapped, draw.donors, own)
+    if plan.has_rest:  # one more entity, which is never swapped
+        rows = torch.cat([rows, own], -1)
     if trajectories is not None:
         steps = torch.arange(window, device=rows.device).view(-1, 1)
         rows = trajectories.later(rows.unsqueeze(1), steps)
     places: dict[int, torch.Tensor] = {}
     masks: dict[tuple[int, int], torch.Tensor] = {}
+    leaves: dict[NestedKey, torch.Tensor] = {}
     for number, leaf in enumerate(plan.leaves):
         value = values[leaf.place]
+        is_complete = sources is None or has_own
         if goals is not None and leaf.is_desired:
-            new = goals(leaf).unsqueeze(1)
+            new, is_complete = goals(leaf).unsqueeze(1), False
         else:
             source = value if sources is None else sources[number]
             if leaf.group not in places:
                 found = _places(rows, leaf, window, len(source))
                 places[leaf.group] = found.to(source.device)
             new = _read(source, places[leaf.group], leaf)
-        if sources is not None:
+        if not is_complete:
             kind = leaf.group, value.ndim
             if kind not in masks:
-                masks[kind] = _mask(draw.swapped, leaf, value.ndim)
+                masks[kind] = _mask(draw.swapped, leaf, value.ndim, plan.has_rest)
             tail = value[first:].unflatten(0, (changed, window))
             new = new.to(tail.device).view(changed, -1, *tail.shape[2:])
             new = torch.where(masks[kind], new, tail).flatten(0, 1)
-        out.set(leaf.key, torch.cat([value[:first], new]) if first else new)
-    return out
+        leaves[leaf.key] = torch.cat([value[:first], new]) if first else new
+    return with_leaves(td, leaves)
 
 
 @lru_cache(maxsize=64)
@@ -412,13 +424,13 @@ def _places(
         torch.Tensor: rows ``[C * window]`` for one entity's leaf; for columns, places
         ``[C * window * D]`` in the source as one vector.
     """
+    if length * leaf.width < 1 << 31:  # half as much to write and to read
+        rows = rows.int()
     if isinstance(leaf.owner, int):
         place = rows[..., leaf.owner : leaf.owner + 1]
     else:
         owner = leaf.owner.to(rows.device)
         place = rows.gather(-1, owner.expand(*rows.shape[:-1], -1))
-    if length * leaf.width < 1 << 31:  # half as much to write and to read
-        place = place.int()
     if rows.ndim == 3:
         inside = _inside(1, leaf.width, rows.device, place.dtype)
     else:
@@ -427,12 +439,16 @@ def _places(
     return torch.add(inside, place, alpha=leaf.width).flatten()
 
 
-def _mask(swapped: torch.Tensor, leaf: SwapLeaf, ndim: int) -> torch.Tensor:
+def _mask(
+    swapped: torch.Tensor, leaf: SwapLeaf, ndim: int, has_rest: bool
+) -> torch.Tensor:
     """Returns which values are swapped, to broadcast with ``[C, window, ...]``."""
     if isinstance(leaf.owner, int):
         return swapped[:, leaf.owner].view(-1, *(1,) * ndim)
     owner = leaf.owner.to(swapped.device).expand(swapped.shape[0], -1)
-    return F.pad(swapped, (0, 1)).gather(1, owner).unsqueeze(1)
+    if has_rest:
+        swapped = F.pad(swapped, (0, 1))
+    return swapped.gather(1, owner).unsqueeze(1)
 
 
 def _read(source: torch.Tensor, places: torch.Tensor, leaf: SwapLeaf) -> torch.Tensor:

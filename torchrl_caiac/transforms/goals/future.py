@@ -14,7 +14,7 @@ from torchrl.data.replay_buffers import SampleUnit
 
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
-from torchrl_caiac._random import draw_integers, draw_numbers
+from torchrl_caiac._random import draw_below, draw_numbers
 from torchrl_caiac._torchrl import sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryCache, TrajectoryIndex
@@ -70,9 +70,7 @@ def draw_goal_offset(
     for name, weight in weights.items():
         drawn = remaining
         if name == "uniform":
-            drawn = draw_integers(
-                remaining.shape, device=device, generator=generator
-            ) % (remaining + 1)
+            drawn = draw_below(remaining + 1, generator=generator)
         elif name == "geometric":
             drawn = torch.minimum(
                 _geometric(remaining.shape, p, device, generator), remaining
@@ -296,7 +294,8 @@ class FutureGoal(RandomTransform, SampleUnit):
             if rows is None:
                 goals = source.gather(1, where.expand(source.shape[0], -1))
             else:
-                places = rows.to(source.device).unsqueeze(-1) * source.shape[-1] + where
+                rows = rows.to(source.device).unsqueeze(-1)
+                places = torch.add(where, rows, alpha=source.shape[-1])
                 goals = pick_places(source, places.flatten()).view(places.shape)
             return {layout.desired_goal_key: goals}
         found: dict[NestedKey, torch.Tensor] = {}

@@ -11,11 +11,12 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import floating
 from torchrl_caiac._random import draw_numbers
+from torchrl_caiac._torchrl import with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_number
 from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
-from torchrl_caiac.transforms.indexing import pick_rows
+from torchrl_caiac.transforms.indexing import window_starts
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import (
     GoalLeaves,
@@ -263,21 +264,31 @@ class HindsightGoal(FutureGoal):
         flags = counterfactual.reshape(-1)
         rows, device = flags.shape[0], flags.device
         chance, pick = draw_numbers(
-            torch.rand, (2, rows), device=device, generator=generator
-        ).double()
-        own = torch.arange(rows, device=device)
-        # Real rows first: each kind draws among its own places.
-        order = torch.argsort(flags.byte(), stable=True)
-        flagged = flags.sum()
-        real = rows - flagged
-        place = (pick * torch.where(flags, flagged, real)).long() + flags * real
-        goal = pick_rows(order, place) + rows
-        if self.future > 0:
-            goal = torch.where(flags | (chance >= self.future), goal, own + 2 * rows)
-        is_relabeled = torch.where(
-            flags, chance < self.counterfactual, chance < self.future + self.random
+            torch.rand,
+            (2, rows),
+            device=device,
+            generator=generator,
+            dtype=torch.float64,
         )
-        source = torch.where(is_relabeled, goal, own)
+        own = window_starts(rows, 1, device)
+        # Counterfactual rows first: each kind draws among its own places.
+        order = torch.argsort(flags.byte(), stable=True, descending=True)
+        size, first = flags.sum(), None
+        if self.random > 0:
+            first = torch.where(flags, 0, size)
+            size = torch.where(flags, size, rows - size)
+        place = (pick * size).long()
+        goal = order.index_select(0, place if first is None else place + first) + rows
+        if self.future > 0:
+            is_future = chance < self.future
+            later = own + 2 * rows
+            if self.random > 0:
+                later = torch.where(is_future, later, goal)
+            goal = torch.where(flags, goal, later)
+        share: Any = self.future + self.random
+        if self.counterfactual != share:
+            share = torch.where(flags, self.counterfactual, share)
+        source = torch.where(chance < share, goal, own)
         return HindsightDraw(source, future)
 
     # --- applying --------------------------------------------------------------------
@@ -343,10 +354,7 @@ class HindsightGoal(FutureGoal):
             KeyError: goals or rewards are missing.
             ValueError: goals or rewards have the wrong shape.
         """
-        out = tensordict.copy()
-        for key, leaf in self._relabel(tensordict, draw).items():
-            out.set(key, leaf)
-        return out
+        return with_leaves(tensordict, self._relabel(tensordict, draw))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels a batch.

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import path
+from torchrl_caiac._torchrl import with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_window
@@ -186,8 +187,8 @@ class WindowGoal(FutureGoal):
             remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
         )
         goals = self.read_goals(data, trajectories.later(last, offset))
-        # Of the first row of each window.
-        steps = offset.to(last.device).unsqueeze(-1) + (self.window - 1)
+        # Of the last row of each window.
+        steps = offset.to(last.device).unsqueeze(-1)
         self.keep_goals({**goals, self.keys.goal_steps: steps})
         return index, info
 
@@ -278,27 +279,29 @@ class WindowGoal(FutureGoal):
                 "the batch already contains counterfactuals, whose goals would not "
                 "follow the swap: append WindowGoal before the augmentation"
             )
-        out = tensordict.copy()
+        leaves: dict[NestedKey, torch.Tensor] = {}
+        device = tensordict.device
+        steps = goals.pop(self.keys.goal_steps)
         for key, goal in goals.items():
-            if goal.shape[0] * self.window != out.shape[0]:
+            if goal.shape[0] * self.window != tensordict.shape[0]:
                 raise RuntimeError(
                     f"goals were drawn for {goal.shape[0]} windows of {self.window} "
-                    f"rows, but the batch has {out.shape[0]} rows: append WindowGoal "
-                    "first, before transforms that change the batch size"
+                    f"rows, but the batch has {tensordict.shape[0]} rows: append "
+                    "WindowGoal first, before transforms that change the batch size"
                 )
-            rows = goal if out.device is None else goal.to(out.device)
+            rows = goal if device is None else goal.to(device)
             if self.window > 1:
                 rows = rows.unsqueeze(1).expand(-1, self.window, *goal.shape[1:])
                 rows = rows.flatten(0, 1)
-            if key == self.keys.goal_steps:
-                passed = torch.arange(len(rows), device=rows.device) % self.window
-                out.set(key, rows - passed.unsqueeze(-1))
-                continue
-            out.set(key, rows)
+            leaves[key] = rows
             after = self.layout.next(key)
-            if out.get(after, None) is not None:
-                out.set(after, rows)
-        return out
+            if tensordict.get(after, None) is not None:
+                leaves[after] = rows
+        if self.window > 1:
+            ahead = torch.arange(self.window - 1, -1, -1, device=steps.device)
+            steps = (steps + ahead).reshape(-1, 1)
+        leaves[self.keys.goal_steps] = steps if device is None else steps.to(device)
+        return with_leaves(tensordict, leaves)
 
     def extra_repr(self) -> str:
         """Returns the arguments, for ``repr``."""
