@@ -126,13 +126,12 @@ def test_bring_your_own_dataset(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a dataset without an author
         make_dataset("my/pushing-v0")
-    (code,) = [
-        b for b in python_blocks((ROOT / "README.md").read_text()) if "CAI(" in b
-    ]
+    page = (ROOT / "docs" / "get_started" / "from_files.md").read_text()
+    (code,) = [block for block in python_blocks(page) if "CAI(" in block]
     code, changed = re.subn(r"steps=[\d_]+", "steps=20, eval_every=10", code)
     assert changed == 1
     scope: dict[str, object] = {}
-    exec(compile(code, "README.md", "exec"), scope)
+    exec(compile(code, "from_files.md", "exec"), scope)
     batch = scope["batch"]
     assert batch["caiac", "swapped"].shape == torch.Size([512, 3])
     assert batch["caiac", "counterfactual"].sum() == 256
@@ -373,22 +372,12 @@ def test_other_keys(flat_data: TensorDictBase) -> None:
     assert rb.sample()["caiac", "counterfactual"].sum() == 4
 
 
-def test_table_of_subpackages() -> None:
-    """The names in the README's table are public names of their subpackages."""
+def test_readme_is_short_and_names_loaders() -> None:
     text = (ROOT / "README.md").read_text()
-    table = text.split("| subpackage | contents |\n|---|---|\n")[1].split("\n\n")[0]
-    for row in table.splitlines():
-        places, names = row.strip("| ").split(" | ")
-        public = [
-            name
-            for place in re.findall(r"`([\w.]+)`", places)
-            for name in importlib.import_module(
-                place if place.startswith("torchrl") else f"torchrl_caiac{place}"
-            ).__all__
-        ]
-        named = re.findall(r"`(\w+)`", names)
-        assert named
-        assert not set(named) - set(public), places
+    assert len(text.splitlines()) <= 150
+    named = re.findall(r"`((?:from|open|load)_\w+)`", text)
+    assert named
+    assert not set(named) - set(importlib.import_module("torchrl_caiac.data").__all__)
 
 
 @pytest.mark.gpu
