@@ -1,7 +1,7 @@
 """The first sample after each write to a full ring, with lookahead.
 
 Run with ``pytest benchmarks/bench_writes.py``. The ring has 1 M rows, and 1,000 are
-written between samples. The whole table of lookahead is built again after each write.
+written between samples, whose trajectories alone are read again.
 """
 
 from __future__ import annotations
