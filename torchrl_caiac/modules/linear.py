@@ -112,7 +112,7 @@ def faster_dtype(rows: int, width: int) -> torch.dtype:
         see :func:`~torchrl_caiac.modules.linear_kernel`.
 
     Examples:
-        >>> from torchrl_caiac.modules.linear import faster_dtype
+        >>> from torchrl_caiac.modules import faster_dtype
         >>> faster_dtype(1, 2) in (torch.float32, torch.bfloat16)
         True
     """
