@@ -34,7 +34,6 @@ __all__ = [
     "forget_leaves",
     "is_in_another_process",
     "is_in_order_of_time",
-    "is_transformed",
     "last_written",
     "loss_masks",
     "mark_memmap",
@@ -50,6 +49,7 @@ __all__ = [
     "storage_revision",
     "storage_rows",
     "tensor_version",
+    "transforms_are_active",
     "vmap_loss",
     "with_leaves",
     "without_generator",
@@ -506,9 +506,9 @@ def packed_linear(
     return apply
 
 
-def is_transformed(tensor: Tensor) -> bool:
-    """Returns whether a tensor is one of :func:`torch.vmap` or :mod:`torch.func`."""
-    found: bool = torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+def transforms_are_active() -> bool:
+    """Returns whether the call is inside of :func:`torch.vmap` or :mod:`torch.func`."""
+    found: bool = torch._C._are_functorch_transforms_active()
     return found
 
 
