@@ -106,6 +106,8 @@ docs: setup ## build the documentation, warnings are errors
 	rm -rf docs/reference/generated
 	MPLBACKEND=agg OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going \
 	    -b html docs docs/_build/html
+	$(if $(BROWSER),$(BIN)/python docs/check_site.py docs/_build/html,@echo \
+	    "no Chromium was found: nobody has looked at the pages" >&2)
 
 clean: ## remove what was built and cached; .venv and outputs stay
 	rm -rf build dist *.egg-info docs/_build docs/auto_tutorials \

@@ -148,6 +148,9 @@ def test_public_names_have_a_docstring(module: str, name: str) -> None:
         return  # a constant: described where it is defined
     doc = inspect.getdoc(thing) or ""
     assert len(doc) > 20, f"{module}.{name} has no docstring"
+    # The reference's tables end a summary at the first point.
+    summary = re.sub(r"`[^`]*`", "", doc.split("\n\n")[0])
+    assert not re.search(r"\.\s", summary), f"{module}.{name}: {summary}"
     own = (
         [
             n

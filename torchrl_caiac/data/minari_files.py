@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -251,9 +252,11 @@ def publish_dataset(
     env = None if make_env is None else make_env()
     options: dict[str, Any] = {}
     if spaces is not None:
-        # Minari would compress images as JPEG.
-        options = {"jpeg_encoding": False}
         options["observation_space"], options["action_space"] = spaces
+        # Minari compresses images as JPEG, from 0.5.4 on.
+        create = minari.create_dataset_from_buffers
+        if "jpeg_encoding" in inspect.signature(create).parameters:
+            options["jpeg_encoding"] = False
     try:
         with whole_folder(target) as made:
             partial = made.parent / "minari"
