@@ -14,7 +14,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint demo fetch-push reproduce figures watch influence thresholds bench docs clean
+.PHONY: help setup test lint demo fetch-push reproduce figures watch online influence thresholds bench docs clean
 
 # A stamp without its interpreter (moved folder, removed Python) does not count.
 ifneq ($(shell $(BIN)/python -c 'print("ok")' 2>/dev/null),ok)
@@ -76,6 +76,10 @@ figures: setup ## draw the results of all studies again
 watch: setup ## film two agents of a study side by side (STUDY=demo)
 	@$(BIN)/python examples/watch.py study=$(or $(STUDY),demo) $(SIZE)
 
+online: setup ## train offline, then collect and train in turn (QUICK=1)
+	@$(BIN)/python examples/online.py $(if $(QUICK),size=quick online.rounds=1 \
+	    online.episodes=2 online.steps=4)
+
 influence: setup ## compare influence estimators (QUICK=1: a smoke run)
 	@for env in fetch_push kitchen kitchen_all_tasks; do \
 	    $(BIN)/python examples/compare_influence.py env=$$env \
@@ -92,16 +96,18 @@ thresholds: setup ## compare suggested thresholds with the best ones
 	$(BIN)/python examples/suggest_thresholds_ogbench.py --out outputs/ogbench \
 	    --publish $(INFLUENCE)
 
-bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
+bench: setup ## measure the hot paths, to docs/results (DEVICE=cpu or cuda)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --benchmark-only \
 	    --device=$(DEVICE) --benchmark-json=benchmark-$(DEVICE).json \
-	    --ratios=benchmark-$(DEVICE).txt
+	    --ratios=docs/results
 
 docs: setup ## build the documentation, warnings are errors
 	rm -rf docs/reference/generated
 	MPLBACKEND=agg OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going \
 	    -b html docs docs/_build/html
+	$(if $(BROWSER),$(BIN)/python docs/check_site.py docs/_build/html,@echo \
+	    "no Chromium was found: nobody has looked at the pages" >&2)
 
 clean: ## remove what was built and cached; .venv and outputs stay
 	rm -rf build dist *.egg-info docs/_build docs/auto_tutorials \

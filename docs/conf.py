@@ -9,7 +9,9 @@ from pathlib import Path
 
 import torchrl_caiac
 
-sys.path.insert(0, str(Path(__file__).parent))  # for gallery_figures
+sys.path.insert(0, str(Path(__file__).parent))  # for the modules beside this one
+
+import make_errors
 
 project = "torchrl-caiac"
 author = "torchrl-caiac contributors"
@@ -20,14 +22,36 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
+    "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_design",
     "sphinx_gallery.gen_gallery",
+    "site_parts",
 ]
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "tutorials", "results"]  # tables that pages include
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+exclude_patterns = ["_build", "inventories", "results", "tutorials"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+html_math_renderer = "mathml"
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+
+# Listed in docs/inventories, so that the build needs no network.
+intersphinx_mapping = {
+    name: (address, f"inventories/{name}.inv")
+    for name, address in {
+        "gymnasium": "https://gymnasium.farama.org/",
+        "matplotlib": "https://matplotlib.org/stable/",
+        "minari": "https://minari.farama.org/",
+        "numpy": "https://numpy.org/doc/stable/",
+        "python": "https://docs.python.org/3/",
+        "tensordict": "https://docs.pytorch.org/tensordict/stable/",
+        "torch": "https://docs.pytorch.org/docs/stable/",
+        "torchrl": "https://docs.pytorch.org/rl/stable/",
+    }.items()
+}
 
 # The reference lists the names in the __all__ of every subpackage, and nothing else.
 autosummary_generate = True
@@ -61,6 +85,7 @@ sphinx_gallery_conf = {
     "ignore_repr_types": r"matplotlib\.figure",
     "remove_config_comments": True,
     "show_memory": False,
+    "write_computation_times": False,
     "download_all_examples": False,
     "abort_on_example_error": True,
 }
@@ -68,9 +93,14 @@ sphinx_gallery_conf = {
 html_theme = "pydata_sphinx_theme"
 html_title = "torchrl-caiac"
 html_show_sourcelink = False
-# Pages without subpages have no navigation to show beside them.
-html_sidebars = {
-    page: []
-    for page in ("index", "usage", "report", "results", "performance", "changelog")
+html_sidebars = {"index": [], "results": []}  # these have no pages below them
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_theme_options = {
+    "header_links_before_dropdown": 7,
+    "navigation_with_keys": False,
+    "show_nav_level": 2,
+    "show_prev_next": False,
 }
-html_theme_options = {"show_prev_next": False, "navigation_with_keys": False}
+
+make_errors.PAGE.write_text(make_errors.page(), encoding="utf-8")

@@ -7,9 +7,10 @@ of offline and online transitions. ``online.episodes=0`` collects nothing, for
 comparison. The policies before the first and after the last round play from the test
 starts. ``size=quick`` is a smoke run, with ``online.rounds=2`` and the like.
 
-The table is ``<publish>/online.csv``. Rounds that are finished are not repeated: a run
-resumes at the last one, with the episodes that it has collected. Workers draw their own
-noise, so a resumed run does not end with the same weights.
+The table is ``<publish>/online.csv``, the figure ``online.png`` beside it. Rounds that
+are finished are not repeated: a run resumes at the last one, with the episodes that it
+has collected. Workers draw their own noise, so a resumed run does not end with the same
+weights.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from shared.console import start
 from shared.parts import make_environment, run_folder
 from shared.settings import keep_settings
 from study import prepare
+from torchrl_caiac._figures import colour, finish_results, new_figure
 from torchrl_caiac._files import read_json, whole_file, write_json
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.data import (
@@ -204,17 +206,52 @@ def write_results(path: Path, new: list[dict[str, Any]]) -> None:
         writer.writerows([*rows, *new])
 
 
+def draw(path: Path) -> None:
+    """Draws the mean success of a table by round, on validation starts."""
+    with path.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["split"] == "validation"]
+    figure = new_figure(5.4, 3.2)
+    axes = figure.add_subplot()
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    groups = dict.fromkeys((row["method"], row["episodes"] != "0") for row in rows)
+    for method, collects in groups:
+        values: dict[int, list[float]] = {}
+        for row in rows:
+            if (row["method"], row["episodes"] != "0") == (method, collects):
+                values.setdefault(int(row["round"]), []).append(float(row["value"]))
+        axes.plot(
+            list(values),
+            [np.mean(found) for found in values.values()],
+            color=colour(methods.index(method)),
+            linestyle="-" if collects else ":",
+            marker="o",
+            markersize=3,
+            label=method if collects else f"{method}, no collecting",
+        )
+    axes.set_xlabel("round")
+    axes.set_ylim(0, 1.1)
+    finish_results(
+        figure,
+        axes,
+        methods=len(groups),
+        ylabel="success, validation starts",
+        title="both cubes at their goals, while collecting",
+    )
+    with whole_file(path.with_suffix(".png")) as partial_file:
+        figure.savefig(partial_file, dpi=150)
+
+
 @hydra.main(version_base=None, config_path="conf", config_name="online")
 def main(cfg: DictConfig) -> None:
     """Runs all methods and seeds."""
     prepare(cfg)
+    path = Path(cfg.publish) / "online.csv"
     for seed in cfg.seeds:
         for method in cfg.method:
             folder = run_folder(cfg, method, seed)
             with start(cfg, folder=folder) as console, console.stage(folder.name):
-                write_results(
-                    Path(cfg.publish) / "online.csv", [*run(cfg, method, seed)]
-                )
+                write_results(path, [*run(cfg, method, seed)])
+            draw(path)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import errno
 import os
 import shutil
 import subprocess
+import tempfile
 import types
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -17,16 +18,46 @@ from hypothesis import settings
 from tensordict import TensorDict, TensorDictBase
 
 from tests.pretend_cuda import pretend_cuda
+from torchrl_caiac import _kernels
 
 FLAT_LENGTHS = (7, 12, 9, 5)
 STATE_WIDTH, ACTION_WIDTH, GOAL_WIDTH = 9, 2, 4
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Tests share the machine with each other: one thread each, and no deadline."""
     torch.set_num_threads(1)
+    # Not the user's choices of kernels; the processes that tests start share them.
+    os.environ.setdefault("MPLCONFIGDIR", os.path.expanduser("~/.cache/matplotlib"))
+    folder = tempfile.TemporaryDirectory()
+    config.add_cleanup(folder.cleanup)
+    os.environ["XDG_CACHE_HOME"] = folder.name
     settings.register_profile("shared", deadline=None)
     settings.load_profile("shared")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts tests with Ray last, since others fork, which its threads do not stand."""
+    items.sort(key=lambda item: "cluster" in getattr(item, "fixturenames", ()))
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[None]:
+    """Ray on this machine, with two workers that import this working tree."""
+    import ray
+
+    os.environ["RAY_ENABLE_UINT_METRICS"] = "0"
+    variables = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+    ray.init(
+        num_cpus=2,
+        include_dashboard=False,
+        object_store_memory=200 << 20,
+        log_to_driver=False,
+        configure_logging=False,
+        runtime_env={"env_vars": variables},
+    )
+    yield
+    ray.shutdown()
 
 
 @pytest.fixture(autouse=True)
@@ -81,6 +112,24 @@ def read_only() -> Iterator[Callable[[Path], None]]:
     yield protect
     for folder in mounted:
         subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@pytest.fixture
+def new_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], None]:
+    """A function after which this process has measured nothing, and finds one faster.
+
+    Its argument is the kernel that is then the fastest for all products.
+    """
+
+    def start(fastest: str) -> None:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache" / fastest))
+        monkeypatch.setattr(_kernels, "_state", _kernels._State())
+        monkeypatch.setattr(_kernels, "_files", {})
+        monkeypatch.setattr(_kernels, "_fastest", lambda default, candidates: fastest)
+
+    return start
 
 
 @pytest.fixture

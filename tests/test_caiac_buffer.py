@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-import ray
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import (
@@ -35,9 +33,10 @@ from torchrl_caiac.modules import (
     GoalConditionedActor,
     GoalConditionedCritic,
     GoalFeatures,
+    LMPModel,
 )
 from torchrl_caiac.noise import sample_rows
-from torchrl_caiac.objectives import GoalConditionedTD3Loss
+from torchrl_caiac.objectives import GoalConditionedTD3Loss, LMPLoss
 from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
 
@@ -95,26 +94,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     transitions().memmap(path)
     score_buffer(offline_buffer(load_transitions(path)), Distance())
     return path
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[None]:
-    os.environ["RAY_ENABLE_UINT_METRICS"] = "0"
-    ray.init(
-        num_cpus=2,
-        include_dashboard=False,
-        object_store_memory=200 << 20,
-        log_to_driver=False,
-        configure_logging=False,
-        runtime_env={
-            "env_vars": {
-                "OMP_NUM_THREADS": "1",
-                "PYTHONPATH": str(Path(__file__).parents[1]),
-            }
-        },
-    )
-    yield
-    ray.shutdown()
 
 
 @pytest.fixture
@@ -271,6 +250,34 @@ def test_td3_trains_from_an_actor(folder: Path, actor: RayReplayBuffer) -> None:
         optimizer.step()
         values.append(float(out["loss_qvalue"].detach()))
     assert sum(values[-10:]) < sum(values[:10]) / 2
+
+
+def test_latent_motor_plans_train_from_an_actor(
+    folder: Path, remote: Callable[..., RayReplayBuffer]
+) -> None:
+    """On augmented windows of it, as from a buffer here."""
+    settings = windows(donors="self", seed=4)
+    trained = []
+    for make in (CAIACReplayBuffer, remote):
+        rb = make(folder, **settings)
+        torch.manual_seed(0)
+        model = LMPModel(3, 2, 2, WINDOW, plan_dim=4, hidden_size=32)
+        model.fit_statistics(rb.sample().reshape(-1, WINDOW))
+        loss = LMPLoss(model)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
+        values = []
+        for _ in range(40):
+            batch = rb.sample().reshape(-1, WINDOW)
+            assert batch["caiac", "swapped"].any()
+            out = loss(batch)
+            total = out["loss_reconstruction"] + out["loss_kl"]
+            optimizer.zero_grad()
+            total.backward()
+            optimizer.step()
+            values.append(float(total.detach()))
+        assert sum(values[-5:]) < 0.85 * sum(values[:5])
+        trained.append(values)
+    assert trained[0] == trained[1]
 
 
 USES: dict[str, Callable[[Any], Any]] = {

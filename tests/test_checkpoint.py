@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import os
 import pickle
 import random
@@ -20,8 +21,11 @@ from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
 from tests.killing import run_killed
 from tests.mutations import mutate_file
+from torchrl_caiac._kernels import onednn_has_float32
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.data import UnreadableFileError
+from torchrl_caiac.modules import linear_kernel
+from torchrl_caiac.modules.linear import linear
 
 
 class Run:
@@ -386,3 +390,97 @@ def test_a_file_cannot_choose_another_adapter(tmp_path):
     os.replace(other, path)
     with pytest.raises(ValueError, match=r"manifest adapter is 'torchrl\.dump_load'"):
         checkpoint.load()
+
+
+class Wide:
+    """A training whose products depend on the kernel."""
+
+    def __init__(self, path: Path) -> None:
+        generator = torch.Generator().manual_seed(0)
+        self.rows = torch.randn(64, 256, generator=generator)
+        self.model = torch.nn.Linear(256, 256)
+        with torch.no_grad():
+            self.model.weight.normal_(generator=generator)
+            self.model.bias.zero_()
+        self.optimizer = torch.optim.SGD(self.model.parameters(), lr=0.01)
+        self.checkpoint = TrainingCheckpoint(
+            path, rng=False, model=self.model, optimizer=self.optimizer
+        )
+
+    def steps(self, first: int, last: int) -> torch.Tensor:
+        for _ in range(first, last):
+            out = linear(self.rows, self.model.weight, self.model.bias, relu=True)
+            self.optimizer.zero_grad()
+            out.square().mean().backward()
+            self.optimizer.step()
+        return self.model.weight.detach().clone()
+
+
+@pytest.fixture
+def of_kernels(tmp_path, new_process, monkeypatch) -> dict[str, torch.Tensor]:
+    """The weights of whole runs with each kernel, which differ."""
+    if not onednn_has_float32():  # bfloat16 then, which is another kernel too
+        monkeypatch.setattr("torchrl_caiac._kernels.onednn_has_float32", lambda: True)
+        monkeypatch.setattr(
+            "torchrl_caiac.modules.linear.onednn_has_float32", lambda: True
+        )
+    found = {}
+    for kernel in ("plain", "onednn"):
+        new_process(kernel)
+        found[kernel] = Wide(tmp_path / f"{kernel}.zip").steps(0, 6)
+    assert not torch.equal(*found.values())
+    return found
+
+
+@pytest.mark.parametrize("first", ["plain", "onednn"])
+def test_a_resumed_run_uses_the_kernels_of_the_first(
+    tmp_path, new_process, of_kernels, first
+):
+    path = tmp_path / "checkpoint.zip"
+    new_process(first)
+    run = Wide(path)
+    run.steps(0, 3)
+    run.checkpoint.save(3)
+    new_process("onednn" if first == "plain" else "plain")
+    run = Wide(path)
+    assert run.checkpoint.load() == 3
+    assert torch.equal(run.steps(3, 6), of_kernels[first])
+    run.checkpoint.save(6)
+    saved = Checkpoint.manifest(path)["metadata"]["linear_kernels"]
+    assert saved["kernel"] == "auto"
+    assert set(saved["chosen"].values()) == {first}  # for the next one
+
+
+def write_metadata(path: Path, **kernels: object) -> None:
+    """Replaces the record of kernels in a checkpoint."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(files["manifest.json"])
+    manifest["metadata"].pop("linear_kernels", None)
+    manifest["metadata"] |= kernels
+    files["manifest.json"] = json.dumps(manifest).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+
+
+def test_another_fixed_kernel_is_refused(tmp_path, new_process):
+    path = tmp_path / "checkpoint.zip"
+    new_process("plain")
+    with linear_kernel("plain"):
+        run = Wide(path)
+        run.steps(0, 1)
+        run.checkpoint.save(1)
+        run.checkpoint.load()
+    with pytest.raises(ValueError, match="linear_kernel: saved 'plain', given 'auto'"):
+        Wide(path).checkpoint.load()
+    write_metadata(path, linear_kernels={"kernel": "fast"})
+    with pytest.raises(UnreadableFileError, match="fast"):
+        Wide(path).checkpoint.load()
+
+
+def test_a_checkpoint_without_kernels_is_read(tmp_path):
+    path = tmp_path / "checkpoint.zip"
+    Wide(path).checkpoint.save(1)
+    write_metadata(path)  # as an earlier version has
+    assert Wide(path).checkpoint.load() == 1

@@ -12,6 +12,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 import torchrl_caiac
 
@@ -64,6 +67,8 @@ CORE = (
     "torchrl_caiac.inspection",
     "torchrl_caiac.modules",
     "torchrl_caiac.objectives",
+    "torchrl_caiac.plotting",
+    "torchrl_caiac.report",
     "torchrl_caiac.scored",
     "torchrl_caiac.transforms",
 )
@@ -81,16 +86,21 @@ def test_core_imports_without_extras() -> None:
     assert run.returncode == 0, run.stderr
 
 
-def test_version_is_that_of_the_project_file() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert importlib.metadata.version("torchrl-caiac") == project["version"]
-    assert f"[{project['version']}]" in (ROOT / "CHANGELOG.md").read_text()
+def test_version_is_one() -> None:
+    """The citation is of the last release, or of the first one to come."""
+    version = Version(importlib.metadata.version("torchrl-caiac"))
+    assert torchrl_caiac.__version__ == str(version)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    fallback = Version(project["setuptools_scm"]["fallback_version"])
+    assert fallback <= version
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == fallback.base_version
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    assert f"\n## [{fallback.base_version}] - " in changelog
 
 
 def test_installed_packages_are_at_their_pins() -> None:
     """A constraints file that does not match what runs here would prove nothing."""
-    from packaging.requirements import Requirement
-
     pins = [
         Requirement(line)
         for line in (ROOT / "constraints.txt").read_text().splitlines()
@@ -118,6 +128,15 @@ def test_all_extra_names_every_other_extra_but_the_peers() -> None:
     assert named == set(extras) - {"all", "bench"}
 
 
+def test_every_supported_python_is_tested() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = [text.rsplit(" ", 1)[1] for text in project["classifiers"]]
+    workflow = yaml.safe_load((ROOT / ".github/workflows/tests.yml").read_text())
+    tested = workflow["jobs"]["tests"]["strategy"]["matrix"]["python"]
+    assert tested == [version for version in named if version.startswith("3.")]
+    assert project["requires-python"] == f">={tested[0]}"
+
+
 def test_package_is_typed() -> None:
     assert (Path(torchrl_caiac.__file__).parent / "py.typed").is_file()
 
@@ -129,6 +148,9 @@ def test_public_names_have_a_docstring(module: str, name: str) -> None:
         return  # a constant: described where it is defined
     doc = inspect.getdoc(thing) or ""
     assert len(doc) > 20, f"{module}.{name} has no docstring"
+    # The reference's tables end a summary at the first point.
+    summary = re.sub(r"`[^`]*`", "", doc.split("\n\n")[0])
+    assert not re.search(r"\.\s", summary), f"{module}.{name}: {summary}"
     own = (
         [
             n

@@ -1,4 +1,4 @@
-"""The code in README.md, CONTRIBUTING.md and docs/usage.md runs, on small datasets."""
+"""The code in README.md, CONTRIBUTING.md and docs runs, on small datasets."""
 
 from __future__ import annotations
 
@@ -97,6 +97,27 @@ def test_from_arrays_to_a_batch(
         assert 85 <= count <= 118  # about 0.8 of 128, the cups that nothing carries
 
 
+def test_home_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (code,) = python_blocks((ROOT / "docs" / "index.md").read_text())
+    exec(compile(code, "index.md", "exec"), {})
+    (count,) = re.findall(r"^tensor\(\[ *0, *(\d+)\]\)$", capsys.readouterr().out, re.M)
+    assert 85 <= int(count) <= 118  # about 0.8 of 128
+
+
+def test_quick_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "get_started" / "quick_start.md").read_text()
+    code = "\n".join(python_blocks(page)).replace("range(500)", "range(20)")
+    scope: dict[str, object] = {}
+    exec(compile(code, "quick_start.md", "exec"), scope)
+    swapped = scope["batch"]["caiac", "swapped"]
+    assert not swapped[:, 0].any() and swapped[:, 1:].any(0).all()
+    assert scope["loss"].isfinite()
+
+
 def test_bring_your_own_dataset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -105,19 +126,22 @@ def test_bring_your_own_dataset(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a dataset without an author
         make_dataset("my/pushing-v0")
-    (code,) = [
-        b for b in python_blocks((ROOT / "README.md").read_text()) if "CAI(" in b
-    ]
+    page = (ROOT / "docs" / "get_started" / "from_files.md").read_text()
+    (code,) = [block for block in python_blocks(page) if "CAI(" in block]
     code, changed = re.subn(r"steps=[\d_]+", "steps=20, eval_every=10", code)
     assert changed == 1
     scope: dict[str, object] = {}
-    exec(compile(code, "README.md", "exec"), scope)
+    exec(compile(code, "from_files.md", "exec"), scope)
     batch = scope["batch"]
     assert batch["caiac", "swapped"].shape == torch.Size([512, 3])
     assert batch["caiac", "counterfactual"].sum() == 256
 
 
-USAGE = python_blocks((ROOT / "docs" / "usage.md").read_text())
+HOW_TO = [
+    block
+    for page in sorted((ROOT / "docs" / "how_to").glob("*.md"))
+    for block in python_blocks(page.read_text())
+]
 LAYOUT = EntityLayout(
     {"gripper": range(3), "cup": [3, 4, 5], "jug": [6, 7, 8]},
     goal={"cup": [0, 1], "jug": [2, 3]},
@@ -126,9 +150,9 @@ LAYOUT = EntityLayout(
 )
 
 
-def run_usage(start: str, **given: object) -> dict[str, object]:
-    """Runs the code block of docs/usage.md that starts so; returns its variables."""
-    (code,) = [block for block in USAGE if block.startswith(start)]
+def run_how_to(start: str, **given: object) -> dict[str, object]:
+    """Runs the code block of docs/how_to that starts so; returns its variables."""
+    (code,) = [block for block in HOW_TO if block.startswith(start)]
     scope = {
         "AttentionInfluence": AttentionInfluence,
         "CAI": CAI,
@@ -153,7 +177,7 @@ def run_usage(start: str, **given: object) -> dict[str, object]:
         "score_buffer": score_buffer,
         **given,
     }
-    exec(compile(code, "usage.md", "exec"), scope)
+    exec(compile(code, "how_to", "exec"), scope)
     return scope
 
 
@@ -170,7 +194,7 @@ in_memory = pytest.mark.parametrize("storage_kind", ["memory"], indirect=True)
 @in_memory
 def test_motion_as_the_estimator(flat_data: TensorDictBase) -> None:
     rb = offline_buffer(flat_data, batch_size=8)
-    scope = run_usage(
+    scope = run_how_to(
         "estimator = MotionInfluence", rb=rb, MotionInfluence=MotionInfluence
     )
     assert rb.storage[:]["caiac", "score"].shape == (len(flat_data), 3)
@@ -180,14 +204,14 @@ def test_motion_as_the_estimator(flat_data: TensorDictBase) -> None:
 @in_memory
 def test_windows(scored: TensorDictBase) -> None:
     long_enough = scored[scored["episode"] == 1]
-    windows = run_usage("goals = WindowGoal", data=long_enough)["windows"]
+    windows = run_how_to("goals = WindowGoal", data=long_enough)["windows"]
     assert windows.batch_size == (128, 10)
     assert windows["caiac", "swapped"].any()
 
 
 @in_memory
 def test_hindsight_goals_and_td3(scored: TensorDictBase) -> None:
-    scope = run_usage("goals = HindsightGoal(layout, reward)\n", data=scored)
+    scope = run_how_to("goals = HindsightGoal(layout, reward)\n", data=scored)
     batch = scope["batch"]
     counterfactual = batch["caiac", "counterfactual"].squeeze(-1)
     assert counterfactual.sum() == 256
@@ -195,11 +219,11 @@ def test_hindsight_goals_and_td3(scored: TensorDictBase) -> None:
     assert relabeled[counterfactual].any()
     assert relabeled[~counterfactual].any()
 
-    scope = run_usage("features = ", rb=scope["rb"], action_dim=2)
+    scope = run_how_to("features = ", rb=scope["rb"], action_dim=2)
     loss = scope["loss"](batch)
     assert loss["loss_actor"].isfinite()
     assert loss["loss_qvalue"].isfinite()
-    loss = run_usage(
+    loss = run_how_to(
         'batch["no_reason"]',
         batch=batch,
         actor=scope["actor"],
@@ -219,7 +243,7 @@ def test_cloning(flat_data: TensorDictBase) -> None:
     data = flat_data
     features = GoalFeatures(LAYOUT)
     features.fit_statistics(data)
-    scope = run_usage(
+    scope = run_how_to(
         "data = select_successful(data",
         data=data,
         actor=GoalConditionedActor(features, data["action"].shape[-1]),
@@ -239,7 +263,7 @@ def test_successful_episodes(flat_data: TensorDictBase) -> None:
     flat_data["next", "reward"] = -torch.ones(len(flat_data), 1)
     flat_data["next", "reward"][9::10] = 0.0
     flat_data["next", "success"] = flat_data["next", "reward"] > -0.5
-    scope = run_usage(
+    scope = run_how_to(
         "demonstrations = ", data=flat_data, select_successful=select_successful
     )
     assert 0 < len(scope["demonstrations"]) < len(flat_data)
@@ -247,7 +271,7 @@ def test_successful_episodes(flat_data: TensorDictBase) -> None:
 
 @in_memory
 def test_replay_buffer_that_relabels_itself(scored: TensorDictBase) -> None:
-    rb = run_usage("goals = HindsightGoal(layout, reward, future=0.0)", data=scored)[
+    rb = run_how_to("goals = HindsightGoal(layout, reward, future=0.0)", data=scored)[
         "rb"
     ]
     batch = rb.sample()
@@ -268,7 +292,7 @@ def test_mixture(
             len(scored)
         )
         rows.memmap(f"data/{name}")
-    tenth = run_usage("expert, random = ")["tenth"]
+    tenth = run_how_to("expert, random = ")["tenth"]
     # 40 random trajectories are 70 % of 57.
     assert len(tenth["episode"].unique()) == 6
     assert (tenth["source"] == 0).any()
@@ -279,7 +303,7 @@ def test_mixture(
 def test_coda(scored: TensorDictBase) -> None:
     rb = offline_buffer(scored, batch_size=8)
     model = TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8)
-    run_usage("attention = ", rb=rb, transformer=model)
+    run_how_to("attention = ", rb=rb, transformer=model)
     assert rb.sample()["coda", "graph"].shape == (8, 4, 3)
     assert rb.sample()["caiac", "swapped"].shape == (8, 3)
 
@@ -288,7 +312,7 @@ def test_coda(scored: TensorDictBase) -> None:
 def test_comparison_of_estimators(flat_data: TensorDictBase) -> None:
     transformer = TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8)
     influenced = torch.rand(len(flat_data), 3) < 0.5
-    table = run_usage(
+    table = run_how_to(
         "table = ",
         data=flat_data,
         truth=SimpleNamespace(influenced=influenced),
@@ -306,7 +330,7 @@ def test_comparison_of_estimators(flat_data: TensorDictBase) -> None:
 
 @in_memory
 def test_nested_layout(nested_data: TensorDictBase) -> None:
-    layout = run_usage("layout = ", EntityLayout=EntityLayout)["layout"]
+    layout = run_how_to("layout = ", EntityLayout=EntityLayout)["layout"]
     assert layout.names == ("arm", "kettle")
     nested_data["caiac", "score"] = torch.zeros(len(nested_data), 2)
     rb = offline_buffer(nested_data, batch_size=8)
@@ -317,7 +341,7 @@ def test_nested_layout(nested_data: TensorDictBase) -> None:
 @in_memory
 def test_rewards_of_transitions(scored: TensorDictBase) -> None:
     rb = offline_buffer(scored, batch_size=8)
-    run_usage("rb.append_transform(\n    CAIACTransform(layout, threshold", rb=rb)
+    run_how_to("rb.append_transform(\n    CAIACTransform(layout, threshold", rb=rb)
     batch = rb.sample()
     assert batch["caiac", "counterfactual"].sum() == 4
 
@@ -344,42 +368,23 @@ def test_other_keys(flat_data: TensorDictBase) -> None:
     flat_data["collector", "traj_ids"] = flat_data.pop("episode")
     rb = offline_buffer(flat_data, batch_size=8)
     model = ready(GaussianWorldModel(LAYOUT, 2, (16, 16)))
-    run_usage("keys = ", rb=rb, estimator=CAI(model))
+    run_how_to("keys = ", rb=rb, estimator=CAI(model))
     assert rb.sample()["caiac", "counterfactual"].sum() == 4
 
 
-def test_table_of_subpackages() -> None:
-    """The names in the README's table are public names of their subpackages."""
+def test_readme_is_short_and_names_loaders() -> None:
     text = (ROOT / "README.md").read_text()
-    table = text.split("| subpackage | contents |\n|---|---|\n")[1].split("\n\n")[0]
-    for row in table.splitlines():
-        places, names = row.strip("| ").split(" | ")
-        public = [
-            name
-            for place in re.findall(r"`([\w.]+)`", places)
-            for name in importlib.import_module(
-                place if place.startswith("torchrl") else f"torchrl_caiac{place}"
-            ).__all__
-        ]
-        named = re.findall(r"`(\w+)`", names)
-        assert named
-        assert not set(named) - set(public), places
-
-
-def test_citation_has_the_version() -> None:
-    def versions(name: str, pattern: str) -> list[str]:
-        return re.findall(pattern, (ROOT / name).read_text(), flags=re.MULTILINE)
-
-    cited = versions("CITATION.cff", r"^version: (\S+)$")
-    assert cited == versions("pyproject.toml", r'^version = "(\S+)"$')
-    assert len(cited) == 1
+    assert len(text.splitlines()) <= 150
+    named = re.findall(r"`((?:from|open|load)_\w+)`", text)
+    assert named
+    assert not set(named) - set(importlib.import_module("torchrl_caiac.data").__all__)
 
 
 @pytest.mark.gpu
 @in_memory
 def test_on_a_gpu(flat_data: TensorDictBase) -> None:
     model = ready(GaussianWorldModel(LAYOUT, 2, (16, 16)))
-    rb = run_usage("model.to", data=flat_data, model=model)["rb"]
+    rb = run_how_to("model.to", data=flat_data, model=model)["rb"]
     batch = rb.sample()
     assert all(leaf.is_cuda for leaf in batch.values(True, True))
     assert batch["caiac", "swapped"].shape == (512, 3)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
 from tensordict import TensorClass, TensorDict, lazy_stack
 from torchrl.data import (
     ImmutableDatasetWriter,
@@ -314,6 +313,16 @@ def test_prefetched_batches_are_dropped(rb):
     assert (rb.sample()["a"] == 9).all()
 
 
+def test_the_state_of_a_buffer_without_its_generator():
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(4), generator=torch.Generator().manual_seed(0)
+    )
+    rb.extend(rows(3))
+    copy = ReplayBuffer.__new__(ReplayBuffer)
+    copy.__setstate__(fence.without_generator(rb.__getstate__()))
+    assert fence.without_generator(copy.__getstate__()) == copy.__getstate__()
+
+
 def test_writes_of_other_threads_wait():
     rb = ReplayBuffer(storage=LazyTensorStorage(4))
     with ThreadPoolExecutor() as pool:
@@ -387,12 +396,24 @@ def test_vmap_over_the_parameters_of_networks():
 
 
 @pytest.mark.parametrize("relu", [False, True])
-def test_linear_pointwise_is_a_linear_layer(relu):
-    x, weight, bias = torch.randn(5, 8), torch.randn(4, 8), torch.randn(4)
-    wanted = F.linear(x, weight, bias)
+def test_packed_linear_is_a_linear_layer(relu):
+    x, weight, bias = torch.randn(3, 5, 8), torch.randn(4, 8), torch.randn(4)
+    wanted = torch.nn.functional.linear(x, weight, bias)
     wanted = wanted.relu() if relu else wanted
-    for w in (weight, fence.packed_weight(weight)):
-        torch.testing.assert_close(fence.linear_pointwise(x, w, bias, relu), wanted)
+    torch.testing.assert_close(fence.packed_linear(weight, bias, relu)(x), wanted)
+
+
+def test_transformed_tensors_are_told_apart():
+    seen = []
+
+    def look(x):
+        seen.append(fence.is_transformed(x))
+        return x.sum()
+
+    look(torch.ones(2))
+    torch.vmap(look)(torch.ones(2, 2))
+    torch.func.grad(look)(torch.ones(2))
+    assert seen == [False, True, True]
 
 
 def test_versions_count_writes():

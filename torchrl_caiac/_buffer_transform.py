@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, NoReturn
 
 import torch
@@ -52,7 +53,8 @@ class RandomTransform(BufferTransform):
     """A transform of a replay buffer that draws random numbers.
 
     The state of its generator is part of ``state_dict``, and so of the saved buffer, as
-    that of the buffer's own generator is.
+    that of the buffer's own generator is. A copy in another process goes on from this
+    state.
 
     Args:
         generator (torch.Generator, optional): source of randomness; ``None`` for
@@ -75,10 +77,11 @@ class RandomTransform(BufferTransform):
         self._origin = _Process()
 
     def warn_if_forked(self) -> None:
-        """Warns, once, in a forked process that draws the numbers of its parent.
+        """Warns, once, in a process that draws the numbers of its parent.
 
-        So do its siblings, and TorchRL's samplers: all of them would get the same rows,
-        goals and donors. A process that was seeded after the fork draws its own.
+        That is one that was forked, or got a transform with a generator. So do its
+        siblings, and TorchRL's samplers: all of them would get the same rows, goals and
+        donors. A process that was seeded after the fork draws its own.
         """
         origin = self._origin
         if origin.pid == os.getpid():
@@ -91,8 +94,8 @@ class RandomTransform(BufferTransform):
         else:
             return
         warnings.warn(
-            f"{type(self).__name__} draws in a process that was forked, with the "
-            f"random numbers of its parent, as its siblings would: {remedy}",
+            f"{type(self).__name__} draws the random numbers of the process that made "
+            f"it, as it does in all processes that were forked or sent it: {remedy}",
             stacklevel=2,
         )
 
@@ -119,8 +122,30 @@ class RandomTransform(BufferTransform):
 class _Process:
     """The process that a transform was created in, and its seed."""
 
-    def __init__(self) -> None:
-        self.pid, self.seed = os.getpid(), torch.initial_seed()
+    def __init__(self, pid: int | None = None, seed: int | None = None) -> None:
+        self.pid = os.getpid() if pid is None else pid
+        self.seed = torch.initial_seed() if seed is None else seed
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _Process, ()  # a copy belongs to the process that makes it
+
+
+def _reduce_process(process: _Process) -> tuple[Any, ...]:
+    # To a process of multiprocessing, which may have siblings.
+    return _Process, (process.pid, process.seed)
+
+
+def _reduce_generator(generator: torch.Generator) -> tuple[Any, ...]:
+    # As bytes. The tensor, torch's own way, would be in shared memory that is freed
+    # before a process that is spawned can open it.
+    state = generator.get_state().numpy().tobytes()
+    return _generator, (str(generator.device), state)
+
+
+def _generator(device: str, state: bytes) -> torch.Generator:
+    made = torch.Generator(device)
+    return made.set_state(torch.frombuffer(bytearray(state), dtype=torch.uint8))
+
+
+ForkingPickler.register(_Process, _reduce_process)
+ForkingPickler.register(torch.Generator, _reduce_generator)

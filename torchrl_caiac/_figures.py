@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchrl_caiac._extras import extra
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -64,9 +66,10 @@ def new_figure(width: float, height: float, pad: float = 0.04) -> Figure:
         >>> float(new_figure(4.0, 3.0).get_figwidth())
         4.0
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
+    with extra("report", "a figure"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     layout = ConstrainedLayoutEngine(w_pad=pad, h_pad=pad, wspace=0.01, hspace=0.02)
     figure = Figure(figsize=(width, height), dpi=150, layout=layout)
@@ -116,6 +119,8 @@ def true_ranges(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
     Examples:
         >>> import numpy as np
+
+    from torchrl_caiac._extras import extra
         >>> from torchrl_caiac._figures import true_ranges
         >>> true_ranges(np.array([True, True, False, True]))
         [(0, 2), (3, 4)]

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 __all__ = [
+    "ThreadLock",
     "available_processors",
     "bar_position",
     "run_in_processes",
@@ -29,6 +30,29 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 # The result of ``setup`` in this process, or the error that it raised.
 _worker: tuple[Any, ...] = ()
 _setup_error: Exception | None = None
+
+
+class ThreadLock:
+    """A reentrant lock between the threads of one process.
+
+    A forked process has its own, since no thread of it would release that of its
+    parent.
+
+    Examples:
+        >>> from torchrl_caiac._processes import ThreadLock
+        >>> lock = ThreadLock()
+        >>> with lock, lock:
+        ...     pass
+    """
+
+    def __init__(self) -> None:
+        self._locks: dict[int, Any] = {}
+
+    def __enter__(self) -> None:
+        self._locks.setdefault(os.getpid(), threading.RLock()).acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._locks[os.getpid()].release()
 
 
 def available_processors() -> int:

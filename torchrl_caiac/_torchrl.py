@@ -8,7 +8,7 @@ and that no other module uses such a name.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -34,13 +34,13 @@ __all__ = [
     "forget_leaves",
     "is_in_another_process",
     "is_in_order_of_time",
+    "is_transformed",
     "last_written",
     "leaf_of",
-    "linear_pointwise",
     "loss_masks",
     "mark_memmap",
     "memmap_folder",
-    "packed_weight",
+    "packed_linear",
     "priority_weight",
     "reduce_loss",
     "sampled_rows",
@@ -53,6 +53,7 @@ __all__ = [
     "tensor_version",
     "vmap_loss",
     "with_leaves",
+    "without_generator",
     "writes_paused",
 ]
 
@@ -337,6 +338,11 @@ def drop_prefetched(rb: ReplayBuffer) -> None:
         rb._clear_prefetch_queue_locked()
 
 
+def without_generator(state: dict[str, Any]) -> dict[str, Any]:
+    """Returns the state with which a buffer is pickled, without its generator."""
+    return {**state, "_rng": None}
+
+
 def set_online_buffer(mixed: OfflineToOnlineReplayBuffer, online: ReplayBuffer) -> None:
     """Replaces the online buffer, which the constructor makes of a storage only."""
     mixed._online_buffer = online
@@ -507,30 +513,32 @@ def vmap_loss(*args: Any, **kwargs: Any) -> Any:
     return _vmap_func(*args, **kwargs)
 
 
-# --- products on CPUs ----------------------------------------------------------------
-
-
-def linear_pointwise(
-    value: Tensor, weight: Tensor, bias: Tensor | None, relu: bool
-) -> Tensor:
-    """Applies oneDNN's linear layer, ``[B, I]`` to ``[B, O]``, in float32 on a CPU.
-
-    ``torch.compile`` replaces ``F.linear`` by the same operator.
-    """
-    after = "relu" if relu else "none"
-    product: Tensor = torch.ops.mkldnn._linear_pointwise(
-        value, weight, bias, after, [], ""
-    )
-    return product
-
-
-def packed_weight(weight: Tensor) -> Tensor:
-    """Returns a weight ``[O, I]`` in oneDNN's fastest layout, for inference."""
-    packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight)
-    return packed
-
-
 # --- tensors -------------------------------------------------------------------------
+
+
+def packed_linear(
+    weight: Tensor, bias: Tensor, relu: bool
+) -> Callable[[Tensor], Tensor]:
+    """Returns oneDNN's linear layer, ``[*B, I]`` to ``[*B, O]``, in float32 on a CPU.
+
+    The weight is copied to the fastest layout. There are no gradients.
+    """
+    packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach())
+    after = "relu" if relu else "none"
+
+    def apply(value: Tensor) -> Tensor:
+        out: Tensor = torch.ops.mkldnn._linear_pointwise(
+            value, packed, bias, after, [], ""
+        )
+        return out
+
+    return apply
+
+
+def is_transformed(tensor: Tensor) -> bool:
+    """Returns whether a tensor is one of :func:`torch.vmap` or :mod:`torch.func`."""
+    found: bool = torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    return found
 
 
 def tensor_version(tensor: Tensor) -> tuple[int, int] | None:

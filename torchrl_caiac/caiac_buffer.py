@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from torchrl.data.replay_buffers import Storage
 from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_caiac._buffer_transform import RandomTransform
+from torchrl_caiac._torchrl import without_generator
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.data.offline_buffer import offline_storage
 from torchrl_caiac.influence import score_buffer
@@ -29,6 +32,10 @@ __all__ = ["CAIACReplayBuffer"]
 Donors = str | Path | Callable[[], ReplayBuffer | TensorStorage]
 
 _OWN = "self"
+_ALONE = (
+    "a buffer with prefetch draws batches in threads, which belong to the process that "
+    "made it: leave out prefetch, or make the buffer in the process that samples"
+)
 _TAKEN = ("storage", "transform", "transform_factory", "sample_unit", "generator")
 
 
@@ -139,12 +146,13 @@ class CAIACReplayBuffer(TensorDictReplayBuffer):
         parts += [
             _made(f"transforms[{i}]", f, Transform) for i, f in enumerate(transforms)
         ]
-        generator = None
-        if seed is not None:
-            generator = torch.Generator().manual_seed(seed)
-            for part in parts:
-                if isinstance(part, RandomTransform) and part.generator is None:
-                    part.set_generator(generator)
+        self._pid, self._prefetches = os.getpid(), bool(kwargs.get("prefetch"))
+        self._drawing = [
+            part
+            for part in parts
+            if isinstance(part, RandomTransform) and part.generator is None
+        ]
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
         super().__init__(
             storage=storage,
             sample_unit=goal,
@@ -152,6 +160,40 @@ class CAIACReplayBuffer(TensorDictReplayBuffer):
             generator=generator,
             **kwargs,
         )
+
+    def set_rng(self, generator: torch.Generator | None) -> None:
+        """Sets the source of randomness of rows, goals and augmentation.
+
+        Args:
+            generator (torch.Generator, optional): ``None`` for torch's default one.
+                Transforms that were made with a generator of their own keep it.
+        """
+        super().set_rng(generator)
+        self._generator = generator
+        for part in self._drawing:
+            part.set_generator(generator)
+
+    def sample(self, *args: Any, **kwargs: Any) -> Any:
+        """Samples a batch, see :meth:`torchrl.data.TensorDictReplayBuffer.sample`.
+
+        Raises:
+            RuntimeError: the buffer has ``prefetch``, and this process was forked.
+        """
+        if self._pid != os.getpid() and self._prefetches:
+            raise RuntimeError(_ALONE)
+        return super().sample(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._prefetches and get_spawning_popen() is not None:
+            raise RuntimeError(_ALONE)
+        # The generator is sent by this class: TorchRL would send its state in a tensor,
+        # which a process that is spawned cannot open, and not to the transforms.
+        return without_generator(super().__getstate__())
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._pid = os.getpid()
+        super().set_rng(self._generator)
 
     def score(self, estimator: Any, **kwargs: Any) -> None:
         """Scores the rows, in the process that contains the buffer.

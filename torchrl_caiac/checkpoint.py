@@ -23,6 +23,7 @@ from torchrl_caiac._files import (
     remove_leftovers,
     whole_file,
 )
+from torchrl_caiac._kernels import UsedKernels, check_kernels, keep_kernels, kernel_mode
 
 __all__ = ["TrainingCheckpoint"]
 
@@ -37,7 +38,8 @@ class TrainingCheckpoint:
 
     The file contains the state of every part, the number of steps, the settings of the
     run and, by default, the state of the global random number generators of torch,
-    NumPy and Python. It is a TorchRL checkpoint
+    NumPy and Python, and which kernels linear layers have used since the object was
+    created (:func:`~torchrl_caiac.modules.linear_kernel`). It is a TorchRL checkpoint
     (:class:`~torchrl.checkpoint.Checkpoint`) in the archive format.
 
     - A file is written atomically: an interrupted write leaves the old file as it was.
@@ -85,6 +87,7 @@ class TrainingCheckpoint:
         self.path = Path(path).expanduser().absolute()
         # Through JSON, so that tuples equal lists.
         self._settings = json.loads(json.dumps(plain(settings or {})))
+        self._used = UsedKernels()
         self._parts = {**parts, "rng": GlobalRNGState()} if rng else parts
         self._checkpoint = Checkpoint(format="directory")
         for name, part in self._parts.items():
@@ -96,7 +99,12 @@ class TrainingCheckpoint:
         Args:
             step (int): the number of steps taken so far.
         """
-        metadata = {"content": _CONTENT, "step": step, "settings": self._settings}
+        metadata = {
+            "content": _CONTENT,
+            "step": step,
+            "settings": self._settings,
+            "linear_kernels": self._used.state(),
+        }
         # TorchRL moves an old file away before it puts the new one in its place.
         with whole_file(self.path) as partial:
             parts = partial.with_name(f"{partial.name}.parts-0")
@@ -119,17 +127,21 @@ class TrainingCheckpoint:
 
         Raises:
             UnreadableFileError: the file is truncated or not a checkpoint of this run.
-            ValueError: its settings differ, or it has more than ``max_step`` steps.
+            ValueError: its settings or its ``linear_kernel`` differ, or it has more
+                than ``max_step`` steps.
         """
         remove_leftovers(self.path)
         if not self.path.exists():
             return 0
         check_archive(self.path, _WHAT, _ADVICE)
         try:
-            step, settings = self._read_manifest()
+            step, settings, kernels = self._read_manifest()
         except Exception as error:
             raise self._unreadable(error) from error
         differences = list(_differences(settings, self._settings))
+        if kernels is not None:
+            mode = kernel_mode()
+            differences += _differences(kernels["kernel"], mode, "linear_kernel")
         if differences:
             raise ValueError(
                 f"the checkpoint {self.path} was made with other settings "
@@ -147,10 +159,12 @@ class TrainingCheckpoint:
             self._restore(loaded.values)
         except Exception as error:
             raise self._unreadable(error) from error
+        if kernels is not None:
+            keep_kernels(kernels)
         return step
 
-    def _read_manifest(self) -> tuple[int, dict[str, Any]]:
-        """Returns the steps and the settings of the file, after checking its parts."""
+    def _read_manifest(self) -> tuple[int, dict[str, Any], dict[str, Any] | None]:
+        """Returns steps, settings and kernels of the file, after checking its parts."""
         manifest = Checkpoint.manifest(self.path)
         metadata, parts = manifest["metadata"], sorted(manifest["components"])
         if metadata.get("content") != _CONTENT:
@@ -162,7 +176,10 @@ class TrainingCheckpoint:
         step, settings = metadata["step"], metadata["settings"]
         if type(step) is not int or step < 0 or not isinstance(settings, dict):
             raise ValueError(f"the step is {step!r} and the settings are {settings!r}")
-        return step, settings
+        kernels = metadata.get("linear_kernels")  # earlier files have none
+        if kernels is not None:
+            check_kernels(kernels)
+        return step, settings, kernels
 
     def _restore(self, states: Mapping[str, Any]) -> None:
         """Restores all parts, or none."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac._figures import (
     GREY,
     NUM_COLOURS,
@@ -67,7 +68,8 @@ def bootstrap_interval(
         >>> 0 <= low < 0.75 < high <= 1
         True
     """
-    from scipy.stats import bootstrap
+    with extra("report", "bootstrap_interval"):
+        from scipy.stats import bootstrap
 
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
@@ -100,7 +102,7 @@ def plot_influence(
     step_seconds: float | None = None,
     title: str = "",
 ) -> Figure:
-    """Plots the influence of the action on each entity along a demonstration (Fig. 6).
+    """Plots the influence of the action on each entity along a demonstration.
 
     An entity gets a colour if its score exceeds the threshold in some row, or if it is
     in contact in some row of the ground truth. All others are grey. Rows with contact
@@ -350,7 +352,7 @@ def plot_success(
     ylabel: str = "success rate",
     title: str = "",
 ) -> Figure:
-    """Plots success by task and method, with bootstrap confidence intervals (Fig. 3).
+    """Plots success by task and method, with bootstrap confidence intervals.
 
     Args:
         results (mapping of str to mapping of str to array-like): for each method and
@@ -526,7 +528,7 @@ def plot_frames(
     columns: int | None = None,
     title: str = "",
 ) -> Figure:
-    """Plots frames next to each other (Fig. 1: a demonstration and counterfactuals).
+    """Plots frames next to each other, such as a demonstration and counterfactuals.
 
     Args:
         frames (array-like): RGB images ``[F, H, W, 3]``, uint8, or floats in [0, 1].

@@ -313,5 +313,5 @@ folder.cleanup()
 # several seeds, 100 starts, up to 1,200 demonstrations, other estimators of influence,
 # and policies that are chosen on starts of their own, see :doc:`/results`.
 #
-# To change the learner, replace the loss. The transform stays the same. :doc:`/usage`
-# says which settings suit which learner.
+# To change the learner, replace the loss. The transform stays the same.
+# :doc:`/how_to/train` says which settings suit which learner.

@@ -78,7 +78,11 @@ class GoalConditioned(Learner):
     def hidden_dtype(self) -> torch.dtype | None:
         """The dtype of the products of the hidden layers."""
         name = self.settings.hidden_dtype
-        return None if name == "float32" else getattr(torch, name)
+        if name not in ("float32", "bfloat16"):
+            raise ValueError(
+                f"learner.hidden_dtype is {name!r}, expected auto, float32 or bfloat16"
+            )
+        return None if name == "float32" else torch.bfloat16
 
     @property
     def rows_at_once(self) -> int:

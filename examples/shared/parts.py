@@ -16,9 +16,12 @@ from omegaconf import DictConfig
 from environments.base import Environment
 from learners.base import Learner
 from methods.base import Method
+from torchrl_caiac._files import read_json, write_json
+from torchrl_caiac.modules.linear import faster_dtype
 
 __all__ = [
     "candidates",
+    "hidden_dtype",
     "kept_steps",
     "make_environment",
     "make_learner",
@@ -59,12 +62,29 @@ def make_methods(cfg: DictConfig) -> dict[str, Method]:
 
 def make_learner(cfg: DictConfig, method: str) -> Learner:
     """Returns the learner ``cfg.learner`` for one of the methods."""
+    if cfg.learner.get("hidden_dtype") == "auto":
+        cfg = cfg.copy()
+        cfg.learner.hidden_dtype = hidden_dtype(cfg)
     return get_class(cfg.learner._target_)(
         cfg.learner,
         make_environment(cfg),
         make_method(cfg, method),
         cfg.env.augmentation,
     )
+
+
+def hidden_dtype(cfg: DictConfig) -> str:
+    """Returns the dtype in which hidden layers are trained the fastest.
+
+    All runs of a folder use what the first one has measured, so that they can be
+    compared, and those that resume continue as they began.
+    """
+    path = make_environment(cfg).folder / cfg.runs / "hidden_dtype.json"
+    if not path.exists():
+        settings = cfg.learner
+        dtype = faster_dtype(settings.batch_size, max(settings.hidden_sizes))
+        write_json(path, {"hidden_dtype": str(dtype).removeprefix("torch.")})
+    return str(read_json(path, "dtype of hidden layers", "delete it")["hidden_dtype"])
 
 
 def run_folder(cfg: DictConfig, method: str, seed: int) -> Path:

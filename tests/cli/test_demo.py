@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -65,15 +66,18 @@ def test_the_extra_is_named(caiac: Caiac, monkeypatch: pytest.MonkeyPatch) -> No
 def test_the_wheel_has_every_example(tmp_path: Path) -> None:
     """What setup.py names is what lies in the folder."""
     code = (
-        "import setuptools, json\n"
+        "import json, runpy, setuptools\n"
         "setuptools.setup = lambda **options: print(json.dumps(options))\n"
-        "exec(compile(open('setup.py').read(), 'setup.py', 'exec'))\n"
+        "runpy.run_path('setup.py')\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     options = json.loads(done.stdout)
+    # A package index has none of the files that the README refers to.
+    addresses = re.findall(r"\]\(([^)]+)\)", options["long_description"])
+    assert addresses and all(re.match("https?:|#", a) for a in addresses)
     packages = {
         p for p in options["packages"] if p.startswith("torchrl_caiac_examples")
     }

@@ -31,7 +31,7 @@ def test_the_reference_is_that_of_the_parser() -> None:
 
 
 def calls() -> list[str]:
-    pages = (PAGE, ROOT / "README.md", ROOT / "docs" / "usage.md")
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     lines = [line for page in pages for line in page.read_text().splitlines()]
     found = [re.match(r"\s*(?:\$ )?caiac (\w.*)", line) for line in lines]
     return sorted({match[1].split(" #")[0] for match in found if match})

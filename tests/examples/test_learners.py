@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from itertools import product
 from types import SimpleNamespace
@@ -436,3 +437,32 @@ class TestChunkActor:
     def test_more_actions_than_in_a_chunk(self, modules, actor):
         with pytest.raises(ValueError, match="execute is 5, expected 1 to 4"):
             modules.chunks.ChunkActor(actor.policy, size=4, execute=5, action_dim=1)
+
+
+@pytest.mark.parametrize("first", ["float32", "bfloat16"])
+def test_the_faster_dtype_is_that_of_the_first_run(
+    first, configure, steps, new_process
+):
+    """Wherever others of the same folder train or resume."""
+    other = "bfloat16" if first == "float32" else "float32"
+    cfg = configure("fetch_push", "td3", "learner.hidden_dtype=auto")
+    new_process(first)
+    steps.train.train(cfg, "motion", 0)
+    new_process(other)
+    learner = steps.train.train(cfg, "motion", 1)
+    assert learner.settings.hidden_dtype == first
+    assert cfg.learner.hidden_dtype == "auto"
+    for seed in (0, 1):
+        folder = steps.parts.run_folder(cfg, "motion", seed)
+        kept = json.loads((folder / "train.json").read_text())
+        assert kept["hidden_dtype"] == first
+    layers = [m for m in learner.actor.modules() if getattr(m, "relu", False)]
+    dtype = None if first == "float32" else torch.bfloat16
+    assert {layer.compute_dtype for layer in layers} == {dtype}
+    steps.train.load_policy(cfg, "motion", 0, cfg.learner.steps)
+
+
+def test_an_unknown_dtype_is_refused(configure, steps):
+    cfg = configure("fetch_push", "td3", "learner.hidden_dtype=float16")
+    with pytest.raises(ValueError, match="'float16', expected auto"):
+        make(steps, cfg)

@@ -57,6 +57,8 @@ def test_results_of_a_run_replace_those_before(steps, tmp_path):
     steps.online.write_results(path, [row])
     steps.online.write_results(path, [other])
     steps.online.write_results(path, [row | {"value": 0.5}])
+    steps.online.draw(path)
+    assert path.with_suffix(".png").stat().st_size > 0
     with path.open(newline="") as file:
         values = [(r["seed"], r["value"]) for r in csv.DictReader(file)]
     assert values == [("2", "1"), ("1", "0.5")]

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import ray
 import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer, score_buffer_ray
+
+pytestmark = pytest.mark.usefixtures("cluster")
 
 
 class Fatal:
@@ -39,25 +39,6 @@ class Fatal:
             else:
                 os.kill(os.getpid(), signal.SIGKILL)
         return (td["observation"] * 1.7).sin().abs()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cluster() -> Iterator[None]:
-    ray.init(
-        num_cpus=2,
-        include_dashboard=False,
-        object_store_memory=200 << 20,
-        log_to_driver=False,
-        configure_logging=False,
-        runtime_env={
-            "env_vars": {
-                "OMP_NUM_THREADS": "1",
-                "PYTHONPATH": str(Path(__file__).parents[2]),
-            }
-        },
-    )
-    yield
-    ray.shutdown()
 
 
 def write(folder: Path, rows: int = 3000) -> Path:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from torchrl_caiac._kernels import onednn_has_float32
 from torchrl_caiac.modules import linear as module
-from torchrl_caiac.modules.linear import linear
+from torchrl_caiac.modules import linear_kernel
+from torchrl_caiac.modules.linear import faster_dtype, inference_linear, linear
+
+KERNELS = ["plain", "onednn"] if onednn_has_float32() else ["plain"]
 
 
-@pytest.fixture(params=[False, True], ids=["torch", "onednn"])
-def onednn(request, monkeypatch) -> bool:
-    """Whether all float32 products, however small, go to oneDNN."""
-    monkeypatch.setattr(module, "_SMALL", 0)
-    monkeypatch.setattr(
-        module,
-        "_onednn",
-        lambda *x: request.param and all(y.dtype == torch.float32 for y in x),
-    )
-    return request.param
+@pytest.fixture(params=KERNELS)
+def kernel(request, monkeypatch) -> Iterator[str]:
+    """What computes all float32 products, however small."""
+    monkeypatch.setattr(module, "_SMALL", 1)
+    with linear_kernel(request.param):
+        yield request.param
 
 
 def draw(*shape: int, seed: int = 0, dtype=torch.float32) -> torch.Tensor:
@@ -45,7 +48,7 @@ def slow_linear(value, weight, bias, relu):
     relu=st.booleans(),
     seed=st.integers(0, 1000),
 )
-def test_values_and_gradients(onednn, dtype, batch, wide, high, relu, seed):
+def test_values_and_gradients(kernel, dtype, batch, wide, high, relu, seed):
     shapes = [(*batch, wide), (high, wide), (high,)]
     operands = [
         draw(*shape, seed=seed + i, dtype=dtype).requires_grad_()
@@ -64,7 +67,7 @@ def test_values_and_gradients(onednn, dtype, batch, wide, high, relu, seed):
         torch.testing.assert_close(a, b, rtol=tolerance, atol=10 * tolerance)
 
 
-def test_factors_that_are_views(onednn):
+def test_factors_that_are_views(kernel):
     value, weight = draw(12, 10)[::2, 1::2], draw(5, 8, seed=1).t()
     for one in (value, value[:1].expand(6, 5), value.t().contiguous().t()):
         torch.testing.assert_close(
@@ -74,7 +77,7 @@ def test_factors_that_are_views(onednn):
 
 
 @pytest.mark.parametrize("relu", [False, True])
-def test_gradients_of_gradients(onednn, relu):
+def test_gradients_of_gradients(kernel, relu):
     def torchs(*operands):
         return F.relu(F.linear(*operands)) if relu else F.linear(*operands)
 
@@ -90,7 +93,7 @@ def test_gradients_of_gradients(onednn, relu):
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_vmap(onednn, shared):
+def test_vmap(kernel, shared):
     value = draw(6, 5) if shared else draw(2, 6, 5)
     weight, bias = draw(2, 3, 5, seed=1).requires_grad_(), draw(2, 3, seed=2)
     mapped = torch.vmap(linear, (None if shared else 0, 0, 0, None))
@@ -102,16 +105,18 @@ def test_vmap(onednn, shared):
     torch.testing.assert_close(a, b)
 
 
-def used(monkeypatch, *operands: torch.Tensor) -> bool:
-    """Whether oneDNN is called for a product."""
-    calls = []
-    product = module._Linear.apply
-    monkeypatch.setattr(
-        module._Linear, "apply", lambda *x: calls.append(x) or product(*x)
-    )
-    got = linear(*operands)
-    torch.testing.assert_close(got, F.linear(*operands))
-    return bool(calls)
+@contextmanager
+def counted(monkeypatch) -> Iterator[list[None]]:
+    """Collects the calls of oneDNN."""
+    calls, through = [], module.through_onednn
+
+    def spy():
+        calls.append(None)
+        return through()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "through_onednn", spy)
+        yield calls
 
 
 @pytest.mark.parametrize(
@@ -122,25 +127,30 @@ def used(monkeypatch, *operands: torch.Tensor) -> bool:
         ("float64", False),
         ("bfloat16", False),
         ("autocast", False),
-        ("narrow", False),
         ("absent", False),
+        ("mapped", False),
     ],
 )
-def test_who_multiplies(monkeypatch, case, want):
-    """oneDNN only where it is there, may be quicker, and gives the same dtype."""
+def test_who_multiplies(monkeypatch, new_process, case, want):
+    """oneDNN only where it is there, may be faster, and gives the same dtype."""
+    new_process("onednn")
     rows = 8 if case == "small" else 256
     operands = [draw(rows, 64), draw(128, 64, seed=1), draw(128, seed=2)]
     if case in ("float64", "bfloat16"):
         operands = [x.to(getattr(torch, case)) for x in operands]
-    capability = "AVX2" if case == "narrow" else "AVX512"
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
-    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: case != "absent")
-    with torch.autocast("cpu", torch.bfloat16, enabled=case == "autocast"):
-        assert used(monkeypatch, *operands) is want
+    product = linear
+    if case == "mapped":
+        operands[0], product = operands[0][None], torch.vmap(linear, (0, None, None))
+    monkeypatch.setattr(module, "onednn_has_float32", lambda: case != "absent")
+    with (
+        torch.autocast("cpu", torch.bfloat16, enabled=case == "autocast"),
+        counted(monkeypatch) as calls,
+    ):
+        torch.testing.assert_close(product(*operands), F.linear(*operands))
+    assert bool(calls) is want
 
 
-@pytest.mark.parametrize("relu", [False, True])
-@pytest.mark.parametrize(
+STRIDED = pytest.mark.parametrize(
     "strided",
     [
         lambda: draw(64, 16)[::4],
@@ -148,26 +158,92 @@ def test_who_multiplies(monkeypatch, case, want):
         lambda: draw(16, 32)[:, :16],
         lambda: draw(1, 16).expand(16, 16),
         lambda: draw(16, 16).t(),
+        lambda: draw(2, 8, 32)[..., ::2],
     ],
-    ids=["rows", "columns", "first", "expanded", "transposed"],
+    ids=["rows", "columns", "first", "expanded", "transposed", "batched"],
 )
-def test_onednn_gets_dense_operands(strided, relu, monkeypatch) -> None:
-    # On others it is hundreds of times slower.
-    monkeypatch.setattr(module, "_SMALL", 0)
-    monkeypatch.setattr(module, "_onednn", lambda *x: True)
-    product, seen = module.linear_pointwise, []
 
-    def spy(value, weight, bias, positive):
-        seen.extend([value, weight])
-        return product(value, weight, bias, positive)
 
-    monkeypatch.setattr(module, "linear_pointwise", spy)
-    value, weight = strided().requires_grad_(), strided().requires_grad_()
-    bias = draw(16, seed=2).requires_grad_()
-    out = linear(value, weight, bias, relu)
-    out.sum().backward()  # whose gradient is expanded
-    assert len(seen) == 6
-    assert all(x.is_contiguous() or x.t().is_contiguous() for x in seen)
-    torch.testing.assert_close(
-        out.double(), slow_linear(value, weight, bias, relu), rtol=1e-4, atol=1e-4
-    )
+@STRIDED
+@pytest.mark.parametrize("relu", [False, True])
+def test_strided_operands(kernel, strided, relu) -> None:
+    operands = [strided(), strided().reshape(16, 16), draw(16, seed=2)]
+    results = []
+    for product in (lambda *x: linear(*x, relu), lambda *x: slow_linear(*x, relu)):
+        factors = [x.detach().requires_grad_() for x in operands]
+        out = product(*factors)
+        out.sum().backward()  # whose gradient is expanded
+        results.append([out.double(), *(x.grad.double() for x in factors)])
+    for got, want in zip(*results, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("needed", [(False, False), (True, False), (False, True)])
+@pytest.mark.parametrize("layout", ["dense", "transposed", "columns", "rows"])
+def test_measuring_computes_the_product_itself(monkeypatch, tmp_path, layout, needed):
+    """What is timed has the shape, the strides and the gradients of what is called."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(module, "_ALIKE", 32)
+    wide = draw(48, 2 * 300, seed=3)
+    value = {
+        "dense": lambda: draw(48, 300),
+        "transposed": lambda: draw(300, 48).t(),
+        "columns": lambda: wide[:, ::2],
+        "rows": lambda: wide[:, :300],
+    }[layout]()
+    weight, bias = draw(200, 300, seed=1), draw(200, seed=2)
+    value.requires_grad_(needed[0])
+    weight.requires_grad_(needed[1])
+    seen, plain = [], module._plain
+
+    def look(value, weight, bias, relu):
+        out = plain(value, weight, bias, relu)
+        grads = (value.requires_grad, weight.requires_grad)
+        seen.append((tuple(value.shape), value.stride(), out.shape[1], relu, grads))
+        return out
+
+    before = torch.get_rng_state()
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_plain", look)
+        linear(value, weight, bias, True)
+    assert torch.equal(before, torch.get_rng_state())
+    stride = (1, 32) if layout == "transposed" else value.stride()
+    timed = [x for x in seen if x[0] == (32, 300)]
+    assert timed
+    assert {x[:4] for x in timed} == {((32, 300), stride, 200, True)}
+    assert needed in {x[4] for x in timed}
+    with monkeypatch.context() as patch:  # and once only
+        patch.setattr(module, "_plain", look)
+        seen.clear()
+        linear(value.detach().requires_grad_(needed[0]), weight, bias, True)
+    assert (32, 300) not in {x[0] for x in seen}
+
+
+@pytest.mark.parametrize("relu", [False, True])
+def test_inference(kernel, relu):
+    weight, bias = draw(6, 5, seed=1), draw(6, seed=2)
+    apply = inference_linear(weight, bias, relu, 8)
+    for value in (draw(8, 5), draw(3, 5), draw(2, 3, 5)):
+        want = slow_linear(value, weight, bias, relu)
+        torch.testing.assert_close(apply(value).double(), want, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["float32", "bfloat16"])
+def test_the_faster_dtype_is_measured_once(new_process, name):
+    new_process(name)
+    assert faster_dtype(256, 64) == getattr(torch, name)
+
+
+def test_both_dtypes_are_measured(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    seen, plain = set(), module._plain
+
+    def look(value, weight, bias, relu):
+        seen.add((value.dtype, tuple(value.shape), tuple(weight.shape), relu))
+        return plain(value, weight, bias, relu)
+
+    monkeypatch.setattr(module, "_plain", look)
+    with linear_kernel("plain"):
+        assert faster_dtype(256, 96) in (torch.float32, torch.bfloat16)
+    shapes = ((256, 96), (96, 96), True)
+    assert seen == {(torch.float32, *shapes), (torch.bfloat16, *shapes)}

@@ -29,6 +29,7 @@ from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.evaluation import swap_shares
 from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.trajectories import trajectory_index
+from torchrl_caiac.transforms import WindowGoal
 from torchrl_caiac.transforms.lookahead import (
     NEVER,
     hold_entities,
@@ -89,6 +90,23 @@ def test_locked_entities_are_those_of_a_slow_search(recording, rule) -> None:
     steps = slow_steps(influenced, episode)
     found = locked_entities(torch.tensor(steps), rule, ~LAYOUT.fixed_mask)
     assert found.tolist() == [slow_locked(row, rule, {0}) for row in steps]
+
+
+@given(recordings(), st.integers(0, 6))
+@settings(max_examples=60, deadline=None)
+def test_what_is_influenced_before_the_goal_is_locked(recording, goal) -> None:
+    steps = slow_steps(*recording)
+    goals = torch.full((len(steps), 1), goal)
+    found = locked_entities(torch.tensor(steps), goals, ~LAYOUT.fixed_mask)
+    assert found.tolist() == [
+        [
+            a or b
+            for a, b in zip(
+                slow_locked(row, "next", {0}), slow_locked(row, goal, {0}), strict=True
+            )
+        ]
+        for row in steps
+    ]
 
 
 def make_rows(influenced: torch.Tensor, episode: torch.Tensor) -> TensorDict:
@@ -361,7 +379,7 @@ def test_scores_changed_in_place_are_refused() -> None:
         rb.sample()
 
 
-@pytest.mark.parametrize("lookahead", [1.5, True, "goal", [1]])
+@pytest.mark.parametrize("lookahead", [1.5, True, "last", [1]])
 def test_wrong_types_are_refused(lookahead) -> None:
     with pytest.raises(TypeError, match="lookahead must be"):
         CAIACTransform(LAYOUT, lookahead=lookahead)
@@ -587,3 +605,94 @@ def test_the_gpu_is_not_waited_for() -> None:
     with nothing_waits():
         batch = rb.sample()
     assert_kept(batch.cpu(), locks(influenced, episode))
+
+
+GOALS = EntityLayout(
+    {"arm": [0], "cup": [1], "lid": [2]},
+    goal={"cup": [0], "lid": [1]},
+    achieved={"cup": [1], "lid": [2]},
+    fixed=["arm"],
+)
+
+
+def make_moving(influenced: torch.Tensor, episode: torch.Tensor) -> TensorDict:
+    """Rows in which an entity moves by 1 where it is influenced, and else stays."""
+    moved = torch.cat([torch.zeros(1, 3), influenced.float().cumsum(0)])
+    rows = make_rows(influenced, episode)
+    base = 1000.0 * episode.unsqueeze(-1)
+    return rows.update(
+        {"observation": base + moved[:-1], ("next", "observation"): base + moved[1:]}
+    )
+
+
+def sample_windows(lookahead: str, window: int) -> list[TensorDict]:
+    options = {}
+    rows = make_moving(*make_influenced())
+    goals = WindowGoal(GOALS, window, mixture={"uniform": 1.0})
+    if window > 1:
+        options["sampler"] = SliceSampler(slice_len=window, traj_key="episode")
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(len(rows)),
+        batch_size=64,
+        sample_unit=goals,
+        **options,
+    )
+    rb.extend(rows)
+    rb.append_transform(goals)
+    rb.append_transform(
+        CAIACTransform(
+            GOALS, counterfactual_ratio=1.0, lookahead=lookahead, window=window
+        )
+    )
+    return [rb.sample() for _ in range(20)]
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_swaps_until_the_goal_leave_nothing_to_do(window: int) -> None:
+    share = {}
+    for lookahead in ("goal", "next"):
+        batch = torch.cat(sample_windows(lookahead, window))
+        swapped = batch["caiac", "swapped"][:, 1:]
+        left = batch["desired_goal"] != batch["next", "observation"][:, 1:]
+        assert swapped.any()
+        share[lookahead] = (left & swapped).sum() / swapped.sum()
+    assert share["goal"] == 0
+    assert share["next"] > 0  # what the donors still have to do
+
+
+def test_steps_to_the_goal_are_those_of_the_goal_row() -> None:
+    rows = make_rows(*make_influenced())
+    goals = WindowGoal(GOALS, 4, mixture={"uniform": 1.0})
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(len(rows)),
+        batch_size=64,
+        sampler=SliceSampler(slice_len=4, traj_key="episode"),
+        sample_unit=goals,
+    )
+    rb.extend(rows)
+    rb.append_transform(goals)
+    batch = rb.sample()
+    # States name their rows: a row is 3 further, and its next state 3 more.
+    ahead = batch["desired_goal"][:, :1] - batch["next", "observation"][:, 1:2]
+    assert torch.equal(batch["hindsight", "steps"], (ahead / 3).long())
+
+
+def test_goals_before_which_to_look_are_needed() -> None:
+    rows = make_rows(*make_influenced())
+    rb = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)), batch_size=64)
+    rb.extend(rows)
+    rb.append_transform(CAIACTransform(LAYOUT, lookahead="goal"))
+    with pytest.raises(KeyError, match="append WindowGoal before this transform"):
+        rb.sample()
+    with pytest.raises(ValueError, match="donors is a buffer, whose rows have none"):
+        CAIACTransform(LAYOUT, lookahead="goal", donors=rb)
+
+
+def test_tables_of_long_trajectories_keep_their_order() -> None:
+    steps = torch.tensor([[0, 32766, 32767], [5, 7, 32767]], dtype=torch.int16)
+    competing = torch.tensor([True, True, True])
+    far = torch.full((2, 1), 10**9)
+    assert locked_entities(steps, far, competing).tolist() == [
+        [True, True, False],
+        [True, True, False],
+    ]

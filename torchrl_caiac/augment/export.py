@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac._files import whole_file
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac.data.write_transitions import check_free
@@ -143,12 +144,8 @@ def export_hdf5(
         ...         file["observations/arm"].shape
         (3, 2)
     """
-    try:
+    with extra("robomimic", str(path)):
         import h5py
-    except ImportError as error:
-        raise ImportError(
-            "HDF5 files need h5py: pip install 'torchrl-caiac[robomimic]'"
-        ) from error
     check_free(path, overwrite)
     with whole_file(path) as partial, h5py.File(partial, "w") as file:
         for name, leaf in _arrays(data):

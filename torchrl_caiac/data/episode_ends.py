@@ -155,8 +155,9 @@ def _check_agree(
 
 def _flags(name: str, value: Any, steps: int) -> NDArray[np.bool_]:
     array = _one_each(name, value, steps)
-    flags = array.astype(bool)
-    if array.dtype.kind not in "biuf" or not (flags == array).all():
+    numbers = array.dtype.kind in "biuf"
+    flags = array.astype(bool) if numbers else np.zeros(len(array), bool)
+    if not numbers or not (flags == array).all():
         raise ValueError(
             f"{name} are not flags: they have the dtype {array.dtype} and values such "
             f"as {array[flags != array][:1]}, expected 0 and 1 (or False and True)"

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac._files import UnreadableFileError
 
 __all__ = ["open_hdf5", "reading_hdf5"]
@@ -38,13 +39,8 @@ def open_hdf5(file: Path) -> Any:
     """
     if not file.exists():
         raise FileNotFoundError(f"there is no file {file}: give another one")
-    try:
+    with extra("robomimic", str(file)):
         import h5py
-    except ImportError as error:
-        raise ImportError(
-            f"{file} needs the package h5py: install it with "
-            "pip install 'torchrl-caiac[robomimic]'"
-        ) from error
     with reading_hdf5(file):
         return h5py.File(file, "r")
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac._files import UnreadableFileError, read_json
 
 __all__ = ["LeRobotDescription", "describe_lerobot", "lerobot_episodes"]
@@ -175,13 +176,8 @@ def _table(file: Path, *names: str) -> list[dict[str, Any]]:
 
 
 def _opened(file: Path) -> Any:
-    try:
+    with extra("lerobot", f"{file}, of a LeRobot dataset,"):
         import pyarrow.parquet as parquet
-    except ImportError as error:
-        raise ImportError(
-            "LeRobot datasets need the package pyarrow: install it with "
-            "pip install 'torchrl-caiac[lerobot]'"
-        ) from error
     try:
         return parquet.ParquetFile(file)
     except Exception as error:  # pyarrow raises many kinds for damaged files

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac._files import UnreadableFileError, whole_folder
 from torchrl_caiac.data.collect import collection_folder
 from torchrl_caiac.data.minari_checks import check_metadata
@@ -46,7 +48,8 @@ def dataset_path(dataset_id: str, root: str | os.PathLike[str] | None = None) ->
     if root is not None:
         # Minari does not support relative paths.
         return Path(root).absolute() / dataset_id
-    from minari.storage import get_dataset_path
+    with extra("envs", dataset_id):
+        from minari.storage import get_dataset_path
 
     return Path(get_dataset_path(dataset_id)).absolute()
 
@@ -117,7 +120,8 @@ def open_minari(
         ...
         FileNotFoundError: no Minari dataset 'push/play-v0' in ...
     """
-    import minari
+    with extra("envs", dataset_id):
+        import minari
 
     data = dataset_path(dataset_id, root) / "data"
     if not data.exists() and download:
@@ -248,9 +252,11 @@ def publish_dataset(
     env = None if make_env is None else make_env()
     options: dict[str, Any] = {}
     if spaces is not None:
-        # Minari would compress images as JPEG.
-        options = {"jpeg_encoding": False}
         options["observation_space"], options["action_space"] = spaces
+        # Minari compresses images as JPEG, from 0.5.4 on.
+        create = minari.create_dataset_from_buffers
+        if "jpeg_encoding" in inspect.signature(create).parameters:
+            options["jpeg_encoding"] = False
     try:
         with whole_folder(target) as made:
             partial = made.parent / "minari"

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from tensordict import TensorDict
 
+from torchrl_caiac._extras import extra
 from torchrl_caiac.data.hdf5_files import open_hdf5, reading_hdf5
 from torchrl_caiac.data.load_array_file import load_array_file
 from torchrl_caiac.data.load_lerobot import load_lerobot
@@ -322,13 +323,8 @@ def _open_transitions(source: str, path: str | Path, *, verify: bool = False) ->
 
 
 def _load_minari(source: str, path: str | Path, **options: Any) -> TensorDict:
-    try:
+    with extra("envs", source):
         import minari  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            f"{source} needs the package minari: install it with "
-            "pip install 'torchrl-caiac[envs]'"
-        ) from error
     root = _minari_root(Path(source))
     if root is None:
         return load_minari(source, path, **options)

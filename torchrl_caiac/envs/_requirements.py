@@ -5,4 +5,4 @@ from __future__ import annotations
 __all__ = ["REQUIREMENTS"]
 
 #: In the form of a requirements file.
-REQUIREMENTS = ("gymnasium-robotics>=1.4,<1.5", "mujoco>=3.1,<3.12")
+REQUIREMENTS = ("gymnasium-robotics>=1.4,<1.5", "mujoco>=3.3.5,<3.12")

@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Bounded
 
 from torchrl_caiac._checks import check_int
+from torchrl_caiac._extras import extra
 from torchrl_caiac._fit_rows import trajectory_numbers
 from torchrl_caiac._keys import as_key, floating, get_leaf
 from torchrl_caiac._layout_units import position_places
@@ -320,13 +321,9 @@ def _held_out_prediction(
     seed: int,
 ) -> NDArray[np.float64]:
     """Predicts the actions of each half of the trajectories from the other half."""
-    try:
+    with extra("report", "action_coverage"):
         from sklearn.ensemble import ExtraTreesRegressor
         from sklearn.linear_model import Ridge
-    except ImportError as error:
-        raise ImportError(
-            "action_coverage needs scikit-learn: pip install 'torchrl-caiac[report]'"
-        ) from error
 
     names, number = np.unique(trajectory, return_inverse=True)
     order = np.random.default_rng(seed).permutation(len(names))

@@ -39,7 +39,7 @@ def causal_action_influence(
     max_memory: int = 256 * 2**20,
     compile: bool | None = None,
 ) -> torch.Tensor:
-    r"""Returns the influence of the action on one entity, eq. 3 of the paper.
+    r"""Returns the influence of the action on one entity, equation 3 of the paper.
 
     .. math:: C^j(s) = \frac{1}{K} \sum_{i=1}^{K} D_{KL}\Big(p_i \,\Big\|\,
         \frac{1}{K} \sum_{k=1}^{K} p_k\Big)

@@ -123,7 +123,9 @@ def score_buffer(
     on the storage object, or, for a memory-mapped storage with a folder, in the file
     that :func:`~torchrl_caiac.influence.score_file` names. Scores with different
     settings are never mixed. ``batch_size`` may change between calls; scores then agree
-    up to rounding. The digest is of the estimator's ``state_dict``, ``repr`` and
+    up to rounding. The record also has what computed linear layers
+    (:func:`~torchrl_caiac.modules.linear_kernel`), which later calls and all processes
+    use. The digest is of the estimator's ``state_dict``, ``repr`` and
     attributes. An estimator whose attributes change while it scores, such as a counter,
     needs a ``__repr__`` (a module: an ``extra_repr``) that names its settings: then
     other attributes than models and tensors are left out.
@@ -311,6 +313,7 @@ def _one_pass(own: ScorePass, *, overwrite: bool, progress: bool) -> bool:
     before = None if overwrite else own.read_record()
     found = None if overwrite else existing_scores(own)
     if found is None:
+        own.keep_kernels(before)
         # Score the first block before anything is written: an estimator or data that
         # do not fit leave the storage unchanged.
         feature_shape = tuple(scorer.block(0).state.shape[1:])
@@ -320,6 +323,7 @@ def _one_pass(own: ScorePass, *, overwrite: bool, progress: bool) -> bool:
         leaves, states, is_first = found
         if bool((states.valid & ~states.moved).all()):
             return True
+        own.keep_kernels(before)
         scorer.feature_shape = feature_shape = tuple(leaves.scores.shape[1:])
         stale, moved = stale_and_moved(own, states)
     with _claimed(own):

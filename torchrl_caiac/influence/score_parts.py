@@ -52,7 +52,7 @@ _SECONDS_BETWEEN_SIGNS = 5.0
 _SECONDS_WITHOUT_SIGN = 60.0
 # Enough ranges that processes end at nearly the same time, and that little is lost with
 # one that is killed; few enough files for a folder.
-_RANGES_PER_PROCESS = 32
+_RANGES_PER_PROCESS, _LEAST_RANGES = 32, 256
 _MOST_CHUNKS = 64
 _TRIES, _SECONDS_BETWEEN_TRIES = 10, 0.1
 _members: set[str] = set()  # those of this process
@@ -109,7 +109,7 @@ def new_plan(
     """
     size, length = geometry["batch_size"], geometry["rows"]
     number = -(-length // size)
-    chunks = -(-number // (_RANGES_PER_PROCESS * processes))
+    chunks = -(-number // max(_RANGES_PER_PROCESS * processes, _LEAST_RANGES))
     chunks = max(1, min(_MOST_CHUNKS, chunks))
     starts = range(0, length, chunks * size)
     if needed is None:

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 
+from torchrl_caiac._kernels import kernel_mode
 from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import (
@@ -80,8 +81,35 @@ class ScorePass:
     def write_record(self, state: str) -> None:
         """Writes the record of the scores."""
         write_record(
-            self.storage, self.data, self.key, self.settings, self.layout, state
+            self.storage,
+            self.data,
+            self.key,
+            self.settings,
+            self.layout,
+            state,
+            self.scorer.kernels,
         )
+
+    def keep_kernels(self, record: dict[str, Any] | None) -> None:
+        """Uses the kernels of earlier scores, if they are recorded.
+
+        Args:
+            record (dict, optional): that of the earlier scores.
+
+        Raises:
+            ValueError: another :func:`~torchrl_caiac.modules.linear_kernel` is set.
+        """
+        kernels = None if record is None else record.get("linear_kernels")
+        if kernels is None:
+            return
+        own = kernel_mode()
+        if own not in ("auto", kernels["kernel"]):
+            raise ValueError(
+                f"the scores in {self.key!r} were computed with linear_kernel "
+                f"{kernels['kernel']!r}, and {own!r} is set: score with that one, or "
+                "call score_buffer(..., overwrite=True) to recompute them"
+            )
+        self.scorer.kernels = kernels
 
 
 def existing_scores(

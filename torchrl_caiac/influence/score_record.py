@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 
 from torchrl_caiac._files import UnreadableFileError, read_json, write_json
+from torchrl_caiac._kernels import check_kernels
 from torchrl_caiac._keys import jsonable, path
 from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.entities import EntityLayout
@@ -93,6 +94,11 @@ def read_record(
         record.get("settings"), dict
     ):
         raise UnreadableFileError(f"the score file {file} is incomplete: {remedy}")
+    try:
+        if record.get("linear_kernels") is not None:  # earlier files have none
+            check_kernels(record["linear_kernels"])
+    except ValueError as error:
+        raise UnreadableFileError(f"in {file} {error}: {remedy}") from error
     return record
 
 
@@ -103,6 +109,7 @@ def write_record(
     settings: dict[str, Any],
     layout: EntityLayout,
     state: str,
+    kernels: dict[str, Any] | None = None,
 ) -> None:
     """Writes the record of some scores, which :func:`read_record` returns.
 
@@ -113,6 +120,7 @@ def write_record(
         settings (dict): what the scores depend on.
         layout (EntityLayout): the entities.
         state (str): ``"new"``, ``"scoring"`` or ``"scored"``.
+        kernels (dict, optional): what computes linear layers.
     """
     record = {
         "format": _FORMAT,
@@ -122,6 +130,7 @@ def write_record(
         "entities": list(layout.names),
         "fingerprint": _sha(json.dumps(settings, sort_keys=True)),
         "settings": settings,
+        "linear_kernels": kernels,
     }
     folder = _folder(data)
     if folder is None:

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_caiac._fingerprints import fingerprint, state_hash
+from torchrl_caiac._kernels import UsedKernels, only_kernels
 from torchrl_caiac._keys import as_key, missing_key
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
@@ -68,6 +69,9 @@ class Scorer:
         feature_shape (tuple of int, optional): the shape of the scores of a row,
             ``None`` until it is known.
         is_prepared (bool): whether the estimator was prepared.
+        kernels (dict, optional): what computes the linear layers of the estimator.
+            ``None`` until the first states have been scored: all others are then
+            scored by the kernels that these have used.
     """
 
     def __init__(
@@ -113,6 +117,7 @@ class Scorer:
         self._blocks: dict[int, _Block] = {}
         self.num_chunks = -(-index.length // batch_size)
         self.feature_shape: tuple[int, ...] | None = None
+        self.kernels: dict[str, Any] | None = None
 
     def span(self, c: int) -> slice:
         """Returns the positions of chunk ``c``."""
@@ -299,8 +304,8 @@ class Scorer:
             scores[needed] = found
         return scores
 
-    def _prepare(self) -> None:
-        """Prepares the estimator with a sample, the same after an interruption."""
+    def _prepared(self) -> Callable[[TensorDictBase], torch.Tensor]:
+        """Returns the estimator, prepared with a sample that is always the same."""
         prepare = getattr(self._estimator, "prepare", None)
         if prepare is not None and not self.is_prepared:
             length = self._index.length
@@ -310,12 +315,12 @@ class Scorer:
             sample = to_device_of(self._estimator, sample)
             prepare(sample, length, smoothing=self._past + self._future + 1)
         self.is_prepared = True
+        return self._estimator
 
     def _evaluate(
         self, states: TensorDictBase, rows: torch.Tensor, what: str
     ) -> torch.Tensor:
         """Returns the estimator's scores of states ``[n]``, after checking them."""
-        self._prepare()
         # A copy: the estimator may write into its input.
         states = to_device_of(self._estimator, states.clone())
         for name, value in states.items(include_nested=True, leaves_only=True):
@@ -326,7 +331,13 @@ class Scorer:
                         f"{name!r} has NaN or infinite values in the {what} of the "
                         f"rows {_some(rows[~finite])}: remove or repair them"
                     )
-        scores = self._estimator(states)
+        if self.kernels is None:
+            used = UsedKernels()
+            scores = self._prepared()(states)
+            self.kernels = used.state()
+        else:
+            with only_kernels(self.kernels):
+                scores = self._prepared()(states)
         self._check_shape(scores, len(rows))
         scores = scores.detach().to("cpu", torch.float32)
         self._check_finite(scores, rows, what)

@@ -123,12 +123,16 @@ def score_shard(
         )
     parts = ScoreParts.of(own.folder, own.key)
     joined = False
+    record = own.read_record()
+    if record is None or record["state"] != "scored":
+        own.scorer.block(0)  # all compile what they need at once, not within the lock
     with parts.taking_part():
         with parts.leading():
             plan = _begin(own, parts, shard[1], overwrite=overwrite)
             if plan is not None:
                 parts.enter()
         if plan is not None:
+            own.keep_kernels(own.read_record())
             own.scorer.feature_shape = tuple(plan.feature_shape)
             _work(own, parts, plan, shard, progress=progress)
             with parts.leading():
@@ -210,16 +214,22 @@ def _begin(
         found = None
     needed = None
     if found is None:
+        own.keep_kernels(None if overwrite else own.read_record())
         # Before anything is written, as in a call without shard.
         shape = tuple(own.scorer.block(0).state.shape[1:])
         own.write_record("new")
         new_leaves(own.storage, own.key, shape)
     else:
         leaves, states, is_first = found
-        if bool((states.valid & ~states.moved).all()):
-            if is_first:
-                own.write_record("scored")
+        is_done = bool((states.valid & ~states.moved).all())
+        if is_done and not is_first:
             return None
+        own.keep_kernels(own.read_record())
+        if is_done:
+            own.write_record("scored")
+            return None
+        if own.scorer.kernels is None:  # not recorded
+            own.scorer.block(0)
         shape = tuple(leaves.scores.shape[1:])
         own.scorer.feature_shape = shape
         todo = rows_to_score(own, *stale_and_moved(own, states), is_first=is_first)

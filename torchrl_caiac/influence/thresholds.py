@@ -142,12 +142,7 @@ class ThresholdSuggestions:
                 "the distributions of the scores are not known: call "
                 "suggest_thresholds(...) and plot what it returns"
             )
-        try:
-            figure = new_figure(7.0, 1.7 * len(self._histograms) + 0.4)
-        except ImportError as error:
-            raise ImportError(
-                "figures need matplotlib: pip install 'torchrl-caiac[report]'"
-            ) from error
+        figure = new_figure(7.0, 1.7 * len(self._histograms) + 0.4)
         axes = figure.subplots(len(self._histograms), 1, squeeze=False)[:, 0]
         for panel, (name, found) in zip(axes, self._histograms.items(), strict=True):
             width = np.diff(found.edges)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_caiac._kernels import linear_kernel
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 from torchrl_caiac.modules.gaussian_world_model import GaussianWorldModel
 from torchrl_caiac.modules.goal_features import GoalFeatures
@@ -24,4 +25,5 @@ __all__ = [
     "LMPModel",
     "RunningNorm",
     "TransformerWorldModel",
+    "linear_kernel",
 ]

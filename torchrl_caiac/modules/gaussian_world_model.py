@@ -13,14 +13,13 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torch.nn.utils import parametrizations
 
-from torchrl_caiac._torchrl import linear_pointwise, packed_weight
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._variance_floor import VarianceFloor
 from torchrl_caiac.modules.entity_dynamics_model import (
     EntityDynamicsModel,
     evaluating,
 )
-from torchrl_caiac.modules.linear import linear
+from torchrl_caiac.modules.linear import inference_linear, linear
 
 __all__ = ["GaussianWorldModel", "gaussian_nll"]
 
@@ -227,8 +226,7 @@ class GaussianWorldModel(EntityDynamicsModel):
 
         The function agrees with :meth:`forward_tensors` on states ``[B, 1, W]`` and
         actions ``[1, K, A]`` in evaluation mode, up to rounding, and has no gradients.
-        Computations that do not depend on the state are done once: the actions' part of
-        the first layer, and the memory layout of the weights. Request a new function
+        The actions' part of the first layer is computed once. Request a new function
         when the model has changed.
 
         Args:
@@ -266,11 +264,15 @@ class GaussianWorldModel(EntityDynamicsModel):
                 self.action_norm(actions.to(dtype)), of_action, first.bias
             )
             later: Any = self.hidden[1:]
-            hidden = [_product(layer.weight, layer.bias, relu=True) for layer in later]
-            heads = _product(
+            hidden = [
+                inference_linear(layer.weight, layer.bias, True, rows)
+                for layer in later
+            ]
+            heads = inference_linear(
                 torch.cat([self.loc_head.weight, self.var_head.weight]),
                 torch.cat([self.loc_head.bias, self.var_head.bias]),
-                relu=False,
+                False,
+                rows,
             )
             shift, gain = self.state_norm.shift, self.state_norm.gain
             floor = self._variance_floor().to(dtype)
@@ -356,32 +358,6 @@ def _orthogonal(layer: nn.Linear) -> nn.Linear:
     nn.init.orthogonal_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
-
-
-def _product(
-    weight: torch.Tensor, bias: torch.Tensor, *, relu: bool
-) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Returns a linear layer for inference, with or without ReLU."""
-    if (
-        weight.device.type == "cpu"
-        and weight.dtype == torch.float32
-        and torch.backends.mkldnn.is_available()
-        and torch.backends.mkldnn.enabled
-    ):
-        # oneDNN, as torch.compile calls it. F.linear uses MKL for float32, which takes
-        # twice as long on other processors than Intel's.
-        weight = packed_weight(weight.detach())
-
-        def product(x: torch.Tensor) -> torch.Tensor:
-            return linear_pointwise(x, weight, bias, relu)
-
-    else:
-
-        def product(x: torch.Tensor) -> torch.Tensor:
-            x = F.linear(x, weight, bias)
-            return x.relu_() if relu else x
-
-    return product
 
 
 def _softplus(x: torch.Tensor) -> torch.Tensor:

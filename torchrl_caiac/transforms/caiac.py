@@ -84,6 +84,9 @@ class CAIACTransform(CounterfactualTransform):
             reason. ``"next"``: the entity that is influenced next is not swapped
             either, nor is it a donor. A number L: nor are entities that are influenced
             in one of the L states after the row (or after the last row of the window).
+            ``"goal"``: nor are, besides the next one, entities that are influenced
+            before the goal that :class:`~torchrl_caiac.transforms.WindowGoal` drew for
+            the row, so that a swap neither adds nor removes what is left to do.
             ``None``: only the row's own score counts, as in Algorithm 1. It reads the
             trajectories of the buffer that samples (one buffer, no
             :class:`~torchrl.data.ReplayBufferEnsemble`), and of the donor buffer, with

@@ -8,11 +8,13 @@ from numbers import Real
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 
 from torchrl_caiac.entities import EntityLayout
 
 __all__ = [
     "LateCheck",
+    "check_batch_shape",
     "check_choice",
     "check_generator",
     "check_layout",
@@ -105,6 +107,44 @@ def check_generator(generator: Any) -> torch.Generator | None:
             f"generator must be a torch.Generator, got {type(generator).__name__}"
         )
     return generator
+
+
+def check_batch_shape(td: TensorDictBase, window: int) -> None:
+    """Raises if a batch does not consist of windows along its last dimension.
+
+    Args:
+        td (TensorDictBase): the batch. A last dimension of size 1, as in slices of an
+            ensemble, does not count.
+        window (int): rows in a window.
+
+    Raises:
+        ValueError: it is a single transition, has no rows, or is no multiple of the
+            window.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.transforms.checks import check_batch_shape
+        >>> check_batch_shape(TensorDict({"a": torch.zeros(2, 10)}, [2, 10]), 5)
+    """
+    sizes = list(td.batch_size)
+    if not sizes:
+        raise ValueError(
+            "the batch has shape [], a single transition: give a batch [B], such as "
+            "the one that a buffer samples, or td.unsqueeze(0)"
+        )
+    while len(sizes) > 1 and sizes[-1] == 1:
+        sizes.pop()
+    if not td.numel():
+        raise ValueError(
+            f"the batch has shape {list(td.shape)}, which has no rows: sample from a "
+            "buffer that is not empty"
+        )
+    if sizes[-1] % window:
+        raise ValueError(
+            f"the batch has shape {list(td.shape)}, whose last dimension is not a "
+            f"multiple of the window {window}: sample whole windows from each buffer"
+        )
 
 
 # --- values --------------------------------------------------------------------------

@@ -9,7 +9,12 @@ from typing import Any, ClassVar, Literal, TypeVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import HERReplayBuffer, ReplayBuffer, TensorStorage
+from torchrl.data import (
+    HERReplayBuffer,
+    ReplayBuffer,
+    ReplayBufferEnsemble,
+    TensorStorage,
+)
 
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._fingerprints import fingerprint_key
@@ -18,6 +23,7 @@ from torchrl_caiac._torchrl import leaf_of, sampled_rows, sampling_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import (
+    check_batch_shape,
     check_choice,
     check_generator,
     check_layout,
@@ -69,8 +75,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             ``"last"``.
         swap_prob (float): probability of swapping what may be swapped.
         window (int): rows in a window, κ.
-        lookahead (int or str, optional): how far ahead influence counts: steps, or
-            ``"next"``.
+        lookahead (int or str, optional): how far ahead influence counts: steps,
+            ``"next"`` or ``"goal"``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
         score_key (NestedKey): the scores.
         unscored (str): what happens to rows without valid scores: ``"raise"`` or
@@ -132,6 +138,12 @@ class CounterfactualTransform(RandomTransform, ABC):
             self._check_goals(goals, donors)
         self.lookahead = check_lookahead(lookahead)
         self._lookahead: Lookahead | None = None
+        if self.lookahead == "goal" and donors is not None:
+            raise ValueError(
+                "lookahead='goal' compares influence with the goals that rows of the "
+                "batch have, but donors is a buffer, whose rows have none: leave out "
+                "donors, to draw them from the batch, or use lookahead='next'"
+            )
         if self.lookahead is not None:
             self._lookahead = Lookahead(
                 self.lookahead,
@@ -457,7 +469,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         self._check_buffer(tensordict)
         shape = tensordict.batch_size
         if len(shape) != 1:
-            self._check_shape(tensordict)
+            check_batch_shape(tensordict, self.window)
             tensordict = tensordict.reshape(-1)
         scores = self._scores(tensordict)
         if not self._thresholds.is_known:
@@ -526,27 +538,6 @@ class CounterfactualTransform(RandomTransform, ABC):
                 f"{1 - self.counterfactual_ratio:g}"
             )
 
-    def _check_shape(self, td: TensorDictBase) -> None:
-        sizes = list(td.batch_size)
-        if not sizes:
-            raise ValueError(
-                "the batch has shape [], a single transition: give a batch [B], "
-                "such as the one that a buffer samples, or td.unsqueeze(0)"
-            )
-        while len(sizes) > 1 and sizes[-1] == 1:  # of slices in an ensemble
-            sizes.pop()
-        if not td.numel():
-            raise ValueError(
-                f"the batch has shape {list(td.shape)}, which has no rows: sample "
-                "from a buffer that is not empty"
-            )
-        if sizes[-1] % self.window:
-            raise ValueError(
-                f"the batch has shape {list(td.shape)}, whose last dimension is not a "
-                f"multiple of the window {self.window}: sample whole windows from each "
-                "buffer"
-            )
-
     def _scores(self, td: TensorDictBase) -> torch.Tensor:
         if not td.shape[0]:
             raise ValueError(
@@ -567,10 +558,12 @@ class CounterfactualTransform(RandomTransform, ABC):
         scores = leaf_of(td, self.score_key)
         if scores is None:
             donors = self.donors_class
+            where = "on the replay buffer"
+            if isinstance(sampling_buffer(), ReplayBufferEnsemble):
+                where = "on each buffer of the ensemble"
             raise KeyError(
                 f"the batch has no {donors.scores_name} in {self.score_key!r}: call "
-                "score_buffer on the replay buffer, or name their key with "
-                f"{donors.key_argument}"
+                f"score_buffer {where}, or name their key with {donors.key_argument}"
             )
         expected = (td.shape[0], *self.feature_shape)
         if tuple(scores.shape) != expected:

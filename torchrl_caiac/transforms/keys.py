@@ -37,6 +37,10 @@ class TransformKeys:
             ``[*B, 1]``. Defaults to ``("next", "terminated")``.
         truncated (NestedKey): the flags of transitions after which the trajectory was
             cut off, ``[*B]`` or ``[*B, 1]``. Defaults to ``("next", "truncated")``.
+        goal_steps (NestedKey): the rows from a transition to the one whose next state
+            is its goal, int64 ``[*B, 1]``, which
+            :class:`~torchrl_caiac.transforms.WindowGoal` writes. Defaults to
+            ``("hindsight", "steps")``.
 
     Raises:
         TypeError: a key is not a ``str`` or a tuple of them.
@@ -57,6 +61,7 @@ class TransformKeys:
     action: NestedKey = "action"
     terminated: NestedKey = ("next", "terminated")
     truncated: NestedKey = ("next", "truncated")
+    goal_steps: NestedKey = ("hindsight", "steps")
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -13,11 +13,18 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, StorageEnsemble, TensorStorage
 
 from torchrl_caiac._fingerprints import fingerprint_key
+from torchrl_caiac._keys import get_leaf
+from torchrl_caiac._processes import ThreadLock
 from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.influence.score_record import read_record
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows, trajectory_index
+from torchrl_caiac.trajectory_cache import (
+    TrajectoryTail,
+    record_writes,
+    written_tail,
+)
 from torchrl_caiac.transforms.checks import LateCheck
 from torchrl_caiac.transforms.indexing import pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -32,15 +39,18 @@ __all__ = [
     "steps_to_influence",
 ]
 
-LookaheadArgument = int | Literal["next"] | None
+LookaheadArgument = int | Literal["next", "goal"] | None
 
 #: The number of steps of an entity that is not influenced any more in its trajectory.
 NEVER = 2**31 - 1
 
+# The most steps that a table has; NEVER is one more.
+_MOST = torch.iinfo(torch.int16).max - 1
+
 # Scores that are compared with the threshold together.
 _CHUNK = 1 << 20
 # Batches may be prefetched by several threads. It is taken before the buffer's lock.
-_BUILDING = threading.RLock()
+_BUILDING = ThreadLock()
 
 
 def check_lookahead(lookahead: object) -> LookaheadArgument:
@@ -53,7 +63,7 @@ def check_lookahead(lookahead: object) -> LookaheadArgument:
         int, str or None: the lookahead.
 
     Raises:
-        TypeError: it is neither an int, ``"next"`` nor ``None``.
+        TypeError: it is neither an int, ``"next"``, ``"goal"`` nor ``None``.
         ValueError: it is negative.
 
     Examples:
@@ -63,11 +73,12 @@ def check_lookahead(lookahead: object) -> LookaheadArgument:
     """
     if lookahead is None:
         return None
-    if isinstance(lookahead, str) and lookahead == "next":
-        return "next"
+    if isinstance(lookahead, str) and lookahead in ("next", "goal"):
+        return lookahead  # type: ignore[return-value]
     if isinstance(lookahead, bool) or not isinstance(lookahead, int):
         raise TypeError(
-            f"lookahead must be a number of steps, 'next' or None, got {lookahead!r}"
+            "lookahead must be a number of steps, 'next', 'goal' or None, got "
+            f"{lookahead!r}"
         )
     if lookahead < 0:
         raise ValueError(f"lookahead is {lookahead}, expected at least 0")
@@ -124,14 +135,18 @@ def _steps(influenced: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
 
 
 def locked_entities(
-    steps: torch.Tensor, rule: int | Literal["next"], competing: torch.Tensor
+    steps: torch.Tensor,
+    rule: int | Literal["next"] | torch.Tensor,
+    competing: torch.Tensor,
 ) -> torch.Tensor:
     """Returns the entities that must stay, since the action is meant for them.
 
     Args:
         steps (torch.Tensor): from :func:`steps_to_influence`, ``[T, N]``.
-        rule (int or str): a number of steps: what is influenced within it. ``"next"``:
-            what is influenced now, or else what is influenced next.
+        rule (int, str or torch.Tensor): a number of steps: what is influenced within
+            it. ``"next"``: what is influenced now, or else what is influenced next. The
+            steps to the goal of each row, ``[T, 1]``: that, and what is influenced
+            before the goal.
         competing (torch.Tensor): bool ``[N]``, the entities that can be the next one.
 
     Returns:
@@ -150,10 +165,14 @@ def locked_entities(
                 [ True, False],
                 [False, False]])
     """
-    if rule != "next":
+    if isinstance(rule, int):
         return steps <= rule
-    first = steps.where(competing, NEVER).amin(-1, keepdim=True)
-    return (steps == 0) | ((steps == first) & (first < NEVER))
+    never = min(NEVER, torch.iinfo(steps.dtype).max)
+    first = steps.where(competing, never).amin(-1, keepdim=True)
+    locked = (steps == 0) | ((steps == first) & (first < never))
+    if isinstance(rule, torch.Tensor):
+        locked |= steps <= rule.clamp(max=never - 1)
+    return locked
 
 
 def hold_entities(scores: torch.Tensor, locked: torch.Tensor) -> torch.Tensor:
@@ -183,15 +202,35 @@ def hold_entities(scores: torch.Tensor, locked: torch.Tensor) -> torch.Tensor:
     return held
 
 
+class _Built(NamedTuple):
+    """A table, and what it was built from.
+
+    Attributes:
+        revision (tuple): the revision of the storage.
+        trajectories (TrajectoryIndex or TrajectoryTail): the trajectories.
+        table (torch.Tensor): ``[capacity, N]``.
+        own (int): the later states in each score.
+        competing (torch.Tensor): bool ``[N]``.
+    """
+
+    revision: tuple[Any, ...]
+    trajectories: TrajectoryIndex | TrajectoryTail
+    table: torch.Tensor
+    own: int
+    competing: torch.Tensor
+
+
 class Lookahead:
     """The entities that stored rows lock, computed when their buffer is first sampled.
 
-    The table has one byte for each row and entity. It is built again after each write
-    to the storage. A row whose score is missing, or that of another state, counts as
-    influenced.
+    The table has one byte for each row and entity, or two with the rule ``"goal"``.
+    After rows were added at the end, or have replaced the oldest ones, it is computed
+    again for the trajectories that were written to; after any other write, for all. A
+    row whose score is missing, or that of another state, counts as influenced.
 
     Args:
-        rule (int or str): see :func:`locked_entities`.
+        rule (int or str): see :func:`locked_entities`; with ``"goal"`` batches have the
+            steps to their goals.
         layout (EntityLayout): the entities.
 
     Keyword Args:
@@ -204,7 +243,7 @@ class Lookahead:
 
     def __init__(
         self,
-        rule: int | Literal["next"],
+        rule: int | Literal["next", "goal"],
         layout: EntityLayout,
         *,
         score_key: NestedKey,
@@ -212,7 +251,7 @@ class Lookahead:
         free: Callable[[torch.Tensor], torch.Tensor],
         competing: Callable[[], torch.Tensor],
     ) -> None:
-        self.rule: int | Literal["next"] = rule
+        self.rule: int | Literal["next", "goal"] = rule
         self.layout = layout
         self.score_key = score_key
         self.keys = keys
@@ -222,7 +261,7 @@ class Lookahead:
 
     def refresh(self) -> None:
         """Drops the tables, so that they are built again."""
-        self._tables: weakref.WeakKeyDictionary[Any, tuple[Any, torch.Tensor]] = (
+        self._tables: weakref.WeakKeyDictionary[Any, _Built] = (
             weakref.WeakKeyDictionary()
         )
         self._seen = threading.local()  # the revision at the last batch of a thread
@@ -234,68 +273,117 @@ class Lookahead:
             source (ReplayBuffer or TensorStorage): the buffer, or its storage.
 
         Returns:
-            torch.Tensor: bool ``[T, N]``.
+            torch.Tensor: bool ``[T, N]``; with the rule ``"goal"`` the steps to the
+            next influence, int16 ``[T, N]``.
 
         Raises:
             KeyError: the scores, or trajectory ids and end flags, are missing.
             TypeError: the storage does not contain a tensordict.
             ValueError: the scores look further ahead than the rule.
         """
+        with _BUILDING, writes_paused(source):
+            return self._table(source).clone()
+
+    def _table(self, source: ReplayBuffer | TensorStorage) -> torch.Tensor:
+        """Returns the table, which the next write may change, within the lock."""
         storage = source.storage if isinstance(source, ReplayBuffer) else source
         data = storage_rows(storage, "the storage of the buffer that samples")
-        with _BUILDING, writes_paused(source):
-            revision = storage_revision(storage)
-            built = self._tables.get(storage)
-            if built is None or built[0] != revision:
-                built = revision, self._build(source, storage, data)
-                self._tables[storage] = built
-            return built[1]
+        revision = storage_revision(storage)
+        built = self._tables.pop(storage, None)  # of which an error leaves nothing
+        if built is None or built.revision != revision:
+            built = self._build(source, storage, data, built)._replace(
+                revision=revision
+            )
+        self._tables[storage] = built
+        return built.table[: len(storage)]
 
     def _build(
         self,
         source: ReplayBuffer | TensorStorage,
         storage: TensorStorage,
         data: TensorDictBase,
-    ) -> torch.Tensor:
+        before: _Built | None,
+    ) -> _Built:
         if data.get(self.score_key, None) is None:
             raise KeyError(
                 f"lookahead={self.rule!r} reads {self.score_key!r} of all rows of the "
                 "storage, which lacks them: store them with score_buffer, or leave out "
                 "lookahead"
             )
-        scores = valid_scores(data, self.score_key, self.layout, len(storage))
         record = read_record(storage, data, self.score_key)
         own = 0 if record is None else int(record["settings"]["lookahead"])
-        if self.rule != "next" and self.rule < own:
+        if isinstance(self.rule, int) and self.rule < own:
             raise ValueError(
                 f"lookahead is {self.rule}, but the scores in {self.score_key!r} "
                 f"contain those of {own} later states: pass at least lookahead={own}, "
                 "or score with score_buffer(..., lookahead=0)"
             )
-        trajectories = trajectory_index(
-            source, trajectory_key=self.keys.trajectory, done_key=self.keys.done
+        competing = self._competes = self._competing().to(
+            data.get(self.score_key).device
         )
-        competing = self._competing().to(scores.device)
+        keys = {"trajectory_key": self.keys.trajectory, "done_key": self.keys.done}
+        is_same = before is not None and before.own == own
+        if before is not None and is_same and torch.equal(before.competing, competing):
+            tail = written_tail(before.trajectories, before.revision, source, **keys)
+            if tail is not None:
+                built = before._replace(trajectories=tail)
+                position = torch.arange(tail.start, tail.length)
+                scores = self._scores(data, tail.rows(position))
+                self._fill(built, scores, tail.start)
+                return built
+        record_writes(storage)
+        scores = valid_scores(data, self.score_key, self.layout, len(storage))
         table = torch.empty(
-            len(scores), len(self.layout), dtype=torch.bool, device=scores.device
+            len(data),  # later rows have their place
+            len(self.layout),
+            dtype=torch.int16 if self.rule == "goal" else torch.bool,
+            device=scores.device,
         )
-        # Whole trajectories at a time, on which no others depend.
+        built = _Built((), trajectory_index(source, **keys), table, own, competing)
+        self._fill(built, scores, None)
+        return built
+
+    def _scores(self, data: TensorDictBase, rows: torch.Tensor) -> torch.Tensor:
+        """Returns the scores of rows, as :func:`valid_scores` does."""
+        states = self.layout.in_keys
+        part = data.select(
+            self.score_key,
+            fingerprint_key(self.score_key),
+            *states,
+            *(self.layout.next(key) for key in states),
+            strict=False,
+        )[rows.to(data.device or "cpu")]
+        return valid_scores(part, self.score_key, self.layout, len(rows))
+
+    def _fill(self, built: _Built, scores: torch.Tensor, first: int | None) -> None:
+        """Fills the table, of whole trajectories at a time, as no others depend on one.
+
+        Args:
+            built (_Built): the table, and the trajectories.
+            scores (torch.Tensor): the scores, by row, or in the order of time.
+            first (int, optional): the position of the first ones in the order of time,
+                where to begin.
+        """
+        index, table = built.trajectories, built.table
         size = max(1, _CHUNK // scores[0].numel())
-        ends, start = trajectories.ends.cpu(), 0
-        while start < trajectories.length:
-            at = torch.searchsorted(ends, min(start + size, trajectories.length) - 1)
+        ends, start = index.ends.cpu(), first or 0
+        while start < index.length:
+            at = torch.searchsorted(ends, min(start + size, index.length) - 1)
             stop = int(ends[at]) + 1
-            position = torch.arange(start, stop, device=trajectories.device)
-            rows = trajectories.rows(position)
-            left = trajectories.remaining(rows).to(scores.device)
-            rows = rows.to(scores.device)
-            parts = rows.split(size)  # of a long trajectory
+            position = torch.arange(start, stop, device=index.ends.device)
+            end = index.ends[torch.searchsorted(index.ends, position)]
+            rows = index.rows(position).to(table.device)
+            own = rows if first is None else (position - first).to(table.device)
+            parts = own.split(size)  # of a long trajectory
             influenced = torch.cat([~self._free(scores[part]) for part in parts])
-            steps = _steps(influenced, left)
-            steps += own * ((steps > 0) & (steps < NEVER))
-            table[rows] = locked_entities(steps, self.rule, competing)
+            steps = _steps(influenced, (end - position).to(table.device))
+            steps += built.own * ((steps > 0) & (steps < NEVER))
+            if self.rule == "goal":
+                steps = steps.clamp(max=_MOST).where(steps < NEVER, _MOST + 1)
+                table[rows] = steps.to(table.dtype)
+            else:
+                table[rows] = locked_entities(steps, self.rule, built.competing)
             start = stop
-        return table
 
     def locked(
         self, source: ReplayBuffer, index: Any, drawn: Any, batch: TensorDictBase
@@ -318,6 +406,7 @@ class Lookahead:
             ``None``.
 
         Raises:
+            KeyError: the batch lacks the steps to its goals, with the rule ``"goal"``.
             RuntimeError: the batch does not consist of these rows, or those of several
                 buffers; or its scores or trajectory ids were changed.
         """
@@ -344,7 +433,7 @@ class Lookahead:
                 "others that select, repeat or reorder rows, or leave out lookahead"
             )
         with _BUILDING, writes_paused(source):  # no write between table and rows
-            found = pick_rows(self.table(source), rows).to(device)
+            found = pick_rows(self._table(source), rows).to(device)
             keys = own if self.keys.trajectory is None else (*own, self.keys.trajectory)
             replaced = _differing(batch, storage_rows(storage), keys, rows)
             revision = storage_revision(storage)
@@ -359,6 +448,16 @@ class Lookahead:
                     "those of the storage: append this transform before those that "
                     "change them in place, or leave out lookahead"
                 )
+        if self.rule == "goal":
+            goal_steps = get_leaf(
+                batch,
+                self.keys.goal_steps,
+                "lookahead='goal' needs the steps to the goal of each row, but the "
+                "batch lacks",
+                "append WindowGoal before this transform, or use lookahead='next'",
+            )
+            competing = self._competes.to(device)
+            found = locked_entities(found, goal_steps, competing)
         return found | replaced.unsqueeze(-1), differs if late else None
 
     def __getstate__(self) -> dict[str, Any]:

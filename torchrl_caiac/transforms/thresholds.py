@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -15,6 +14,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac._columns import check_names
+from torchrl_caiac._processes import ThreadLock
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.thresholds import suggest_thresholds
 from torchrl_caiac.transforms.checks import check_number
@@ -22,7 +22,7 @@ from torchrl_caiac.transforms.checks import check_number
 __all__ = ["EntityThresholds", "ThresholdArgument"]
 
 _logger = logging.getLogger("torchrl_caiac.transforms.thresholds")
-_CHOOSING = threading.Lock()
+_CHOOSING = ThreadLock()
 
 ThresholdArgument = float | Mapping[str, float] | Literal["auto"]
 

@@ -17,7 +17,8 @@ from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_below, draw_numbers
 from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.trajectories import TrajectoryCache, TrajectoryIndex
+from torchrl_caiac.trajectories import TrajectoryIndex
+from torchrl_caiac.trajectory_cache import TrajectoryCache
 from torchrl_caiac.transforms.checks import check_generator, check_layout
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys

@@ -113,7 +113,7 @@ class WindowGoal(FutureGoal):
                 f"{dict(mixture)}"
             )
         self.mixture = dict(mixture)
-        self.out_keys = self.goal_keys
+        self.out_keys = [*self.goal_keys, self.keys.goal_steps]
 
     def _reset_state(self) -> None:
         super()._reset_state()
@@ -186,7 +186,10 @@ class WindowGoal(FutureGoal):
         offset = draw_goal_offset(
             remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
         )
-        self.keep_goals(self.read_goals(data, trajectories.later(last, offset)))
+        goals = self.read_goals(data, trajectories.later(last, offset))
+        # Of the last row of each window.
+        steps = offset.to(last.device).unsqueeze(-1)
+        self.keep_goals({**goals, self.keys.goal_steps: steps})
         return index, info
 
     def _check_windows(
@@ -255,7 +258,7 @@ class WindowGoal(FutureGoal):
 
         Returns:
             TensorDictBase: a shallow copy with desired goals, also under ``next``
-            where the batch has them there.
+            where the batch has them there, and the steps from each row to its goal.
 
         Raises:
             RuntimeError: no goals were drawn for this batch, or it was augmented
@@ -277,6 +280,8 @@ class WindowGoal(FutureGoal):
                 "follow the swap: append WindowGoal before the augmentation"
             )
         leaves: dict[NestedKey, torch.Tensor] = {}
+        device = tensordict.device
+        steps = goals.pop(self.keys.goal_steps)
         for key, goal in goals.items():
             if goal.shape[0] * self.window != tensordict.shape[0]:
                 raise RuntimeError(
@@ -284,7 +289,6 @@ class WindowGoal(FutureGoal):
                     f"rows, but the batch has {tensordict.shape[0]} rows: append "
                     "WindowGoal first, before transforms that change the batch size"
                 )
-            device = tensordict.device
             rows = goal if device is None else goal.to(device)
             if self.window > 1:
                 rows = rows.unsqueeze(1).expand(-1, self.window, *goal.shape[1:])
@@ -293,6 +297,10 @@ class WindowGoal(FutureGoal):
             after = self.layout.next(key)
             if tensordict.get(after, None) is not None:
                 leaves[after] = rows
+        if self.window > 1:
+            ahead = torch.arange(self.window - 1, -1, -1, device=steps.device)
+            steps = (steps + ahead).reshape(-1, 1)
+        leaves[self.keys.goal_steps] = steps if device is None else steps.to(device)
         return with_leaves(tensordict, leaves)
 
     def extra_repr(self) -> str:
