@@ -96,11 +96,11 @@ thresholds: setup ## compare suggested thresholds with the best ones
 	$(BIN)/python examples/suggest_thresholds_ogbench.py --out outputs/ogbench \
 	    --publish $(INFLUENCE)
 
-bench: setup ## measure the hot paths (DEVICE=cpu or cuda)
+bench: setup ## measure the hot paths, to docs/results (DEVICE=cpu or cuda)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --benchmark-only \
 	    --device=$(DEVICE) --benchmark-json=benchmark-$(DEVICE).json \
-	    --ratios=benchmark-$(DEVICE).txt
+	    --ratios=docs/results
 
 docs: setup ## build the documentation, warnings are errors
 	rm -rf docs/reference/generated

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterator
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,12 @@ import pytest
 import torch
 
 from benchmarks.ratios import Judged
+from torchrl_caiac._kernels import machine, processor_slug
+from torchrl_caiac._processes import available_processors
 
-_JUDGED = pytest.StashKey[list[Judged]]()
+_LINES = pytest.StashKey[list[str]]()
+# The units that decide which kernels are fast, by their names in torch.
+_UNITS = {"AVX2": "avx2", "AVX-512": "avx512_f", "bfloat16": "bf16", "AMX": "amx"}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -20,7 +25,29 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--device", default="cpu", choices=["cpu", "cuda"], help="where to measure"
     )
-    parser.addoption("--ratios", help="a file that the list of ratios is written to")
+    parser.addoption(
+        "--ratios",
+        help="a folder, in which benchmark_<processor>.txt gets the list of ratios",
+    )
+
+
+def described(name: str) -> str:
+    """Returns the processor, or the card, and what it has."""
+    own = machine()
+    units = ", ".join(
+        f"{unit} {'yes' if any(part in x for x in own['units']) else 'no'}"
+        for unit, part in _UNITS.items()
+    )
+    card = f"{torch.cuda.get_device_name()}; " if name == "cuda" else ""
+    return (
+        f"{card}{own['processor']}, {available_processors()} cores; {units}; "
+        f"torch {own['torch']}; {date.today()}"
+    )
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    """Names the processor at the start of a run."""
+    return described(config.getoption("--device"))
 
 
 @pytest.fixture(scope="session")
@@ -70,7 +97,7 @@ def judge(benchmark: Any, request: pytest.FixtureRequest) -> Callable[..., None]
         if target is None or None not in (at_least, at_most):
             raise ValueError("a ratio has one target, at_least or at_most")
         judged = Judged(name, value, target, at_least is not None)
-        request.config.stash.setdefault(_JUDGED, []).append(judged)
+        request.config.stash.setdefault(_LINES, []).append(str(judged))
         benchmark.extra_info[name] = {
             "ratio": round(value, 4),
             "at_least" if judged.at_least else "at_most": target,
@@ -80,12 +107,22 @@ def judge(benchmark: Any, request: pytest.FixtureRequest) -> Callable[..., None]
     return judge
 
 
+@pytest.fixture
+def note(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    """Adds a line to the list of ratios: ``note("text")``."""
+    return request.config.stash.setdefault(_LINES, []).append
+
+
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     """Lists the ratios, their targets, and whether they are met."""
-    lines = [str(one) for one in config.stash.get(_JUDGED, [])]
-    if lines:
+    device = config.getoption("--device")
+    lines = [described(device), "", *config.stash.get(_LINES, [])]
+    if lines[2:]:
         terminalreporter.section("ratios and their targets")
         for line in lines:
             terminalreporter.write_line(line)
     if config.getoption("--ratios"):
-        Path(config.getoption("--ratios")).write_text("\n".join(lines) + "\n")
+        name = "cuda" if device == "cuda" else processor_slug(machine()["processor"])
+        file = Path(config.getoption("--ratios"), f"benchmark_{name}.txt")
+        file.write_text("\n".join(lines) + "\n")
+        terminalreporter.write_line(f"written to {file}")

@@ -12,7 +12,12 @@ import torch
 
 
 def seconds(
-    calls: Mapping[str, Callable[[], Any]], *, rounds: int, warmup: int = 2
+    calls: Mapping[str, Callable[[], Any]],
+    *,
+    rounds: int,
+    warmup: int = 2,
+    clock: Callable[[], float] = time.perf_counter,
+    statistic: Callable[[list[float]], float] = median,
 ) -> dict[str, float]:
     """The median seconds of each call.
 
@@ -21,13 +26,13 @@ def seconds(
     times: dict[str, list[float]] = {name: [] for name in calls}
     for number in range(warmup + rounds):
         for name, call in calls.items():
-            begin = time.perf_counter()
+            begin = clock()
             call()
             if torch.cuda.is_initialized():
                 torch.cuda.synchronize()
             if number >= warmup:
-                times[name].append(time.perf_counter() - begin)
-    return {name: median(values) for name, values in times.items()}
+                times[name].append(clock() - begin)
+    return {name: statistic(values) for name, values in times.items()}
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ LAYERS = [
         "_layout_yaml",
         "entities",
         "trajectories",
+        "trajectory_cache",
     },
     {"checkpoint", "data"},
     {"noise", "layouts"},

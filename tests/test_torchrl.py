@@ -247,9 +247,7 @@ class Pose(TensorClass):
     x: torch.Tensor
 
 
-@pytest.mark.parametrize("device", [None, "cpu"])
-@pytest.mark.parametrize("kind", ["plain", "names", "lazy stack", "parts"])
-def test_with_leaves_is_a_copy_with_leaves(kind, device):
+def batch_of(kind, device=None):
     td = TensorDict({"a": torch.zeros(2), "next": {"a": torch.zeros(2)}}, [2], device)
     td.set_non_tensor("name", "kitchen")
     if kind == "names":
@@ -260,6 +258,38 @@ def test_with_leaves_is_a_copy_with_leaves(kind, device):
         td["pose"] = Pose(x=torch.zeros(2), batch_size=[2])
         td["stack"] = lazy_stack([TensorDict({"a": torch.zeros(())})] * 2)
         td["lone"] = TensorDict({"a": torch.zeros(2)})
+    return td
+
+
+KINDS = pytest.mark.parametrize("kind", ["plain", "names", "lazy stack", "parts"])
+
+
+@KINDS
+def test_leaf_of_is_get(kind):
+    td = batch_of(kind)
+    tensors = ["a", ("a",), ("next", "a"), ("pose", "x"), ("stack", "a"), ("lone", "a")]
+    for key in [*tensors, "b", ("next", "b"), ("new", "b"), "name", "next", ("a", "b")]:
+        try:
+            wanted = td.get(key, None)
+        except Exception as error:
+            with pytest.raises(type(error)):
+                fence.leaf_of(td, key)
+            continue
+        found = fence.leaf_of(td, key)
+        assert type(found) is type(wanted)
+        if isinstance(wanted, torch.Tensor):
+            assert torch.equal(found, wanted)
+
+
+def test_leaf_of_a_memory_mapped_tensordict(tmp_path):
+    data = rows(3).memmap(tmp_path)
+    assert fence.leaf_of(data, "a") is data.get("a")
+
+
+@pytest.mark.parametrize("device", [None, "cpu"])
+@KINDS
+def test_with_leaves_is_a_copy_with_leaves(kind, device):
+    td = batch_of(kind, device)
     td.lock_()
     keys = ["a", ("next", "a"), ("next", "b"), ("new", "b"), ("pose", "x")]
     leaves = {key: torch.ones(2) for key in [*keys, ("stack", "a")]}
@@ -363,6 +393,14 @@ def test_vmap_over_the_parameters_of_networks():
     params = TensorDict.from_modules(*networks)
     found = fence.vmap_loss(networks[0], (None, 0))(x, params)
     torch.testing.assert_close(found, torch.stack([net(x) for net in networks]))
+
+
+@pytest.mark.parametrize("relu", [False, True])
+def test_packed_linear_is_a_linear_layer(relu):
+    x, weight, bias = torch.randn(3, 5, 8), torch.randn(4, 8), torch.randn(4)
+    wanted = torch.nn.functional.linear(x, weight, bias)
+    wanted = wanted.relu() if relu else wanted
+    torch.testing.assert_close(fence.packed_linear(weight, bias, relu)(x), wanted)
 
 
 def test_transformed_tensors_are_told_apart():

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join, path
+from torchrl_caiac._torchrl import leaf_of
 
 __all__ = [
     "fingerprint",
@@ -215,7 +216,7 @@ def state_leaves(
 ) -> Iterator[torch.Tensor]:
     """Yields the tensors of a state, always in the same order."""
     for key in keys:
-        value = td.get(key, None)
+        value = leaf_of(td, key)
         if type(value) is torch.Tensor and value.numel():  # the usual case, quickly
             yield value
             continue

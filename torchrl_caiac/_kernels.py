@@ -98,7 +98,7 @@ def linear_kernel(kernel: Literal["auto", "plain", "onednn"]) -> Iterator[None]:
     - ``"onednn"`` is the same with ``torch.backends.mkldnn.matmul.fp32_precision`` set
       to ``"bf16"`` during the call, for which torch takes oneDNN. Processors without
       AMX then still compute in float32. Those with AMX would round to bfloat16, so
-      there this kernel is refused.
+      there this kernel is refused. Scores are computed by oneDNN's own operator.
     - ``"auto"``, the default without this context manager, measures both when a shape
       occurs for the first time, in some milliseconds, and takes oneDNN if that saves
       10 % of the time. The choice is kept in a file in ``~/.cache/torchrl_caiac`` (or

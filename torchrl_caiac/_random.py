@@ -48,7 +48,7 @@ def draw_numbers(
     source = device if generator is None else generator.device
     pinned = source.type == "cpu" and device.type == "cuda"
     drawn = kind(*args, generator=generator, device=source, pin_memory=pinned, **kwargs)
-    return drawn.to(device, non_blocking=pinned)
+    return drawn if source == device else drawn.to(device, non_blocking=pinned)
 
 
 def draw_integers(

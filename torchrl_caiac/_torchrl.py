@@ -8,7 +8,7 @@ and that no other module uses such a name.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -36,9 +36,11 @@ __all__ = [
     "is_in_order_of_time",
     "is_transformed",
     "last_written",
+    "leaf_of",
     "loss_masks",
     "mark_memmap",
     "memmap_folder",
+    "packed_linear",
     "priority_weight",
     "reduce_loss",
     "sampled_rows",
@@ -349,6 +351,34 @@ def set_online_buffer(mixed: OfflineToOnlineReplayBuffer, online: ReplayBuffer) 
 # --- batches -------------------------------------------------------------------------
 
 
+def leaf_of(td: TensorDictBase, key: NestedKey) -> Any:
+    """Returns an entry of a tensordict: ``td.get(key, None)``, in half of the time.
+
+    Args:
+        td (TensorDictBase): the tensordict.
+        key (NestedKey): the entry.
+
+    Returns:
+        Any: the entry, ``None`` if there is none.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._torchrl import leaf_of
+        >>> td = TensorDict({"a": {"b": torch.zeros(2)}}, [2])
+        >>> leaf_of(td, ("a", "b")), leaf_of(td, ("c", "b"))
+        (tensor([0., 0.]), None)
+    """
+    node: Any = td
+    for part in (key,) if isinstance(key, str) else key:
+        if type(node) is not TensorDict:
+            return td.get(key, None)
+        node = node._tensordict.get(part)
+        if node is None:
+            return None
+    return node if type(node) is Tensor else td.get(key, None)
+
+
 def with_leaves(
     td: TensorDictBase, leaves: Mapping[NestedKey, Tensor]
 ) -> TensorDictBase:
@@ -484,6 +514,25 @@ def vmap_loss(*args: Any, **kwargs: Any) -> Any:
 
 
 # --- tensors -------------------------------------------------------------------------
+
+
+def packed_linear(
+    weight: Tensor, bias: Tensor, relu: bool
+) -> Callable[[Tensor], Tensor]:
+    """Returns oneDNN's linear layer, ``[*B, I]`` to ``[*B, O]``, in float32 on a CPU.
+
+    The weight is copied to the fastest layout. There are no gradients.
+    """
+    packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach())
+    after = "relu" if relu else "none"
+
+    def apply(value: Tensor) -> Tensor:
+        out: Tensor = torch.ops.mkldnn._linear_pointwise(
+            value, packed, bias, after, [], ""
+        )
+        return out
+
+    return apply
 
 
 def is_transformed(tensor: Tensor) -> bool:

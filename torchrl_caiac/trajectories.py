@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -15,14 +14,12 @@ from torchrl_caiac._keys import missing_key, path
 from torchrl_caiac._torchrl import (
     is_in_order_of_time,
     last_written,
-    storage_revision,
     storage_rows,
 )
 
 __all__ = [
     "COLLECTOR_KEY",
     "STEPS_KEY",
-    "TrajectoryCache",
     "TrajectoryIndex",
     "end_flags",
     "flat_rows",
@@ -314,59 +311,6 @@ def flat_rows(
     for coordinate, size in zip(index, storage.shape, strict=True):
         rows = rows * size + coordinate
     return rows.reshape(-1)
-
-
-class TrajectoryCache:
-    """Caches the index of a storage until the storage is written to.
-
-    Keyword Args:
-        trajectory_key (NestedKey, optional): see :func:`trajectory_index`.
-        done_key (NestedKey, optional): see :func:`trajectory_index`.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl.data import LazyTensorStorage
-        >>> from torchrl_caiac.trajectories import TrajectoryCache
-        >>> cache = TrajectoryCache(trajectory_key="episode", done_key=None)
-        >>> storage = LazyTensorStorage(4)
-        >>> storage.set(range(2), TensorDict({"episode": torch.zeros(2)}, [2]))
-        >>> cache.get(storage) is cache.get(storage)
-        True
-    """
-
-    def __init__(
-        self, *, trajectory_key: NestedKey | None, done_key: NestedKey | None
-    ) -> None:
-        self.trajectory_key = trajectory_key
-        self.done_key = done_key
-        self._built: tuple[Any, tuple[Any, ...], TrajectoryIndex] | None = None
-
-    def get(self, storage: TensorStorage) -> TrajectoryIndex:
-        """Returns the index of the storage as it is now.
-
-        Args:
-            storage (TensorStorage): the storage.
-
-        Returns:
-            TrajectoryIndex: see :func:`trajectory_index`, also for what is raised.
-        """
-        built, revision = self._built, storage_revision(storage)
-        if built is None or built[0]() is not storage or built[1] != revision:
-            index = trajectory_index(
-                storage, trajectory_key=self.trajectory_key, done_key=self.done_key
-            )
-            self._built = built = (weakref.ref(storage), revision, index)
-        return built[2]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _new_cache, (self.trajectory_key, self.done_key)
-
-
-def _new_cache(
-    trajectory_key: NestedKey | None, done_key: NestedKey | None
-) -> TrajectoryCache:
-    return TrajectoryCache(trajectory_key=trajectory_key, done_key=done_key)
 
 
 def _picked(source: torch.Tensor, where: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -11,6 +13,7 @@ from torchrl.data import (
     ReplayBuffer,
     ReplayBufferEnsemble,
 )
+from torchrl.envs.transforms import Transform
 
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.data import offline_to_online_buffer
@@ -23,6 +26,7 @@ LAYOUT = EntityLayout(
     fixed=("arm",),
 )
 ROWS = 60
+SCORE = ("caiac", "score")
 
 
 def reward(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
@@ -65,6 +69,23 @@ def buffer(first: int | None, lookahead: str | None = None) -> ReplayBuffer:
     rb.append_transform(CAIACTransform(LAYOUT, 0.5, lookahead=lookahead))
     rb.append_transform(goals)
     return rb
+
+
+def plain(data: TensorDict, *transforms: Transform) -> ReplayBuffer:
+    rb = ReplayBuffer(storage=LazyTensorStorage(ROWS), batch_size=40)
+    rb.extend(data)
+    for transform in transforms:
+        rb.append_transform(transform)
+    return rb
+
+
+def unscored(first: int, how: str) -> TensorDict:
+    """The rows, without scores or with NaN."""
+    data = rows(first)
+    if how == "missing":
+        return data.exclude(SCORE)
+    data[SCORE].fill_(float("nan"))
+    return data
 
 
 def assert_from_its_own_buffer(batch: TensorDict, first: int) -> None:
@@ -130,3 +151,52 @@ def test_hindsight_goals_without_a_sample_unit_are_refused() -> None:
     ensemble = ReplayBufferEnsemble(buffer(0), buffer(1000), batch_size=40)
     with pytest.raises(RuntimeError, match="no future goals were drawn"):
         ensemble.sample()
+
+
+@pytest.mark.parametrize("how", ["missing", "nan"])
+def test_an_unscored_member_is_refused(how: str) -> None:
+    """By a transform of each buffer, and by one of all samples."""
+    make = partial(CAIACTransform, LAYOUT, 0.5)
+    scored, other = rows(0), unscored(1000, how)
+    each = [plain(data, make()) for data in (scored, other)]
+    wanted = r"no scores in .*call score_buffer on the" if how == "missing" else "NaN"
+    error = KeyError if how == "missing" else ValueError
+    mixed = offline_to_online_buffer(*each)
+    with pytest.raises(error, match=wanted):
+        mixed.sample(40)
+    ensemble = ReplayBufferEnsemble(
+        plain(scored), plain(other), batch_size=40, sample_from_all=True
+    )
+    ensemble.append_transform(make())
+    wanted = wanted.replace("on the", "on each buffer of the ensemble")
+    with pytest.raises(error, match=wanted):
+        ensemble.sample()
+
+
+def test_unscored_rows_of_a_member_may_be_kept() -> None:
+    keep = CAIACTransform(LAYOUT, 0.5, counterfactual_ratio=1.0, unscored="keep")
+    ensemble = ReplayBufferEnsemble(
+        plain(rows(0)),
+        plain(unscored(1000, "nan")),
+        batch_size=40,
+        sample_from_all=True,
+    )
+    ensemble.append_transform(keep)
+    own, online = ensemble.sample()
+    assert keep.unscored_count == 20
+    assert own["caiac", "swapped"].any()
+    assert ((own["observation"] >= 0) & (own["observation"] < ROWS)).all()
+    assert not online["caiac", "swapped"].any()
+    assert (online["observation"] == online["action"]).all()
+
+
+def test_entries_of_one_buffer_only_are_named() -> None:
+    augmented = plain(rows(0), CAIACTransform(LAYOUT, 0.5))
+    mixed = offline_to_online_buffer(augmented, plain(rows(1000)), batch_size=40)
+    with pytest.raises(KeyError, match=r"only the offline buffer's .*'swapped'.*score"):
+        mixed.sample()
+    mixed = offline_to_online_buffer(
+        plain(unscored(0, "missing")), plain(rows(1000)), batch_size=40
+    )
+    with pytest.raises(KeyError, match=r"the online one .*'caiac', 'score'"):
+        mixed.sample()

@@ -244,6 +244,6 @@ def test_both_dtypes_are_measured(monkeypatch, tmp_path):
 
     monkeypatch.setattr(module, "_plain", look)
     with linear_kernel("plain"):
-        assert faster_dtype(24, 40) in (torch.float32, torch.bfloat16)
-    shapes = ((24, 40), (40, 40), True)
+        assert faster_dtype(256, 96) in (torch.float32, torch.bfloat16)
+    shapes = ((256, 96), (96, 96), True)
     assert seen == {(torch.float32, *shapes), (torch.bfloat16, *shapes)}

@@ -91,6 +91,18 @@ def test_integer_states_are_swapped_and_not_checked() -> None:
     assert plan.states == () and len(plan.leaves) == 2
 
 
+@pytest.mark.parametrize("has_donors", [False, True])
+def test_nothing_follows_a_swap_if_all_entities_are_fixed(has_donors: bool) -> None:
+    layout = EntityLayout.from_keys({"arm": "arm"}, fixed=["arm"])
+    state = {"arm": torch.arange(4.0).view(4, 1)}
+    td = TensorDict({**state, "next": state, ("caiac", "score"): torch.zeros(4, 1)}, 4)
+    rb = ReplayBuffer(storage=LazyTensorStorage(4))
+    rb.extend(td)
+    transform = CAIACTransform(layout, donors=rb if has_donors else None)
+    out = transform(td)
+    assert torch.equal(out["arm"], td["arm"]) and not out["caiac", "swapped"].any()
+
+
 @pytest.mark.parametrize("stack", [False, True])
 def test_leaves_of_lazy_stacks_keep_their_names(stack: bool) -> None:
     """A lazy stack orders its leaves differently in keys() and in items()."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tensordict import TensorDictBase
 from torchrl.data import OfflineToOnlineReplayBuffer, ReplayBuffer
 
 from torchrl_caiac._torchrl import set_online_buffer
@@ -36,7 +37,8 @@ def offline_to_online_buffer(
             ``None``: passed to every call of ``sample``.
 
     Returns:
-        OfflineToOnlineReplayBuffer: its batches have offline rows first.
+        OfflineToOnlineReplayBuffer: its batches have offline rows first. ``sample``
+        raises a ``KeyError`` with the entries that only one buffer has.
 
     Raises:
         TypeError: one of them is not a replay buffer.
@@ -63,11 +65,40 @@ def offline_to_online_buffer(
             )
     if offline is online:
         raise ValueError("offline and online are the same buffer: give two")
-    mixed = OfflineToOnlineReplayBuffer(
-        offline,
-        online_storage=online.storage,
-        offline_fraction=offline_fraction,
-        batch_size=batch_size,
-    )
-    set_online_buffer(mixed, online)
-    return mixed
+    return _OfflineToOnlineReplayBuffer(offline, online, offline_fraction, batch_size)
+
+
+class _OfflineToOnlineReplayBuffer(OfflineToOnlineReplayBuffer):
+    def __init__(
+        self,
+        offline: ReplayBuffer,
+        online: ReplayBuffer,
+        offline_fraction: float,
+        batch_size: int | None,
+    ) -> None:
+        super().__init__(
+            offline,
+            online_storage=online.storage,
+            offline_fraction=offline_fraction,
+            batch_size=batch_size,
+        )
+        set_online_buffer(self, online)
+        self._default = batch_size
+
+    def sample(self, batch_size: int | None = None) -> TensorDictBase:
+        try:
+            return super().sample(batch_size)
+        except KeyError as error:
+            if "incompatible" not in str(error):  # raised by one of the buffers
+                raise
+            buffers = (self.offline_buffer, self.online_buffer)
+            own, other = (
+                set(rb.sample(batch_size or self._default).keys(True, True))
+                for rb in buffers
+            )
+            raise KeyError(
+                f"only the offline buffer's samples have {sorted(own - other, key=str)}"
+                f", and only those of the online one {sorted(other - own, key=str)}: "
+                "append the same transforms to both, and score both, with score_buffer "
+                "or ScoreOnWrite"
+            ) from error

@@ -313,7 +313,7 @@ def _one_pass(own: ScorePass, *, overwrite: bool, progress: bool) -> bool:
     before = None if overwrite else own.read_record()
     found = None if overwrite else existing_scores(own)
     if found is None:
-        own.choose_kernels(before)
+        own.keep_kernels(before)
         # Score the first block before anything is written: an estimator or data that
         # do not fit leave the storage unchanged.
         feature_shape = tuple(scorer.block(0).state.shape[1:])
@@ -323,7 +323,7 @@ def _one_pass(own: ScorePass, *, overwrite: bool, progress: bool) -> bool:
         leaves, states, is_first = found
         if bool((states.valid & ~states.moved).all()):
             return True
-        own.choose_kernels(before)
+        own.keep_kernels(before)
         scorer.feature_shape = feature_shape = tuple(leaves.scores.shape[1:])
         stale, moved = stale_and_moved(own, states)
     with _claimed(own):

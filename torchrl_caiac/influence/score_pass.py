@@ -90,8 +90,8 @@ class ScorePass:
             self.scorer.kernels,
         )
 
-    def choose_kernels(self, record: dict[str, Any] | None) -> None:
-        """Uses the kernels of earlier scores, or those of the first block.
+    def keep_kernels(self, record: dict[str, Any] | None) -> None:
+        """Uses the kernels of earlier scores, if they are recorded.
 
         Args:
             record (dict, optional): that of the earlier scores.
@@ -101,7 +101,6 @@ class ScorePass:
         """
         kernels = None if record is None else record.get("linear_kernels")
         if kernels is None:
-            self.scorer.block(0)
             return
         own = kernel_mode()
         if own not in ("auto", kernels["kernel"]):

@@ -132,7 +132,7 @@ def score_shard(
             if plan is not None:
                 parts.enter()
         if plan is not None:
-            own.choose_kernels(own.read_record())
+            own.keep_kernels(own.read_record())
             own.scorer.feature_shape = tuple(plan.feature_shape)
             _work(own, parts, plan, shard, progress=progress)
             with parts.leading():
@@ -214,7 +214,7 @@ def _begin(
         found = None
     needed = None
     if found is None:
-        own.choose_kernels(None if overwrite else own.read_record())
+        own.keep_kernels(None if overwrite else own.read_record())
         # Before anything is written, as in a call without shard.
         shape = tuple(own.scorer.block(0).state.shape[1:])
         own.write_record("new")
@@ -224,10 +224,12 @@ def _begin(
         is_done = bool((states.valid & ~states.moved).all())
         if is_done and not is_first:
             return None
-        own.choose_kernels(own.read_record())
+        own.keep_kernels(own.read_record())
         if is_done:
             own.write_record("scored")
             return None
+        if own.scorer.kernels is None:  # not recorded
+            own.scorer.block(0)
         shape = tuple(leaves.scores.shape[1:])
         own.scorer.feature_shape = shape
         todo = rows_to_score(own, *stale_and_moved(own, states), is_first=is_first)

@@ -16,12 +16,12 @@ from torchrl_caiac._kernels import (
     onednn_has_float32,
     through_onednn,
 )
-from torchrl_caiac._torchrl import is_transformed
+from torchrl_caiac._torchrl import is_transformed, packed_linear
 
 __all__ = ["faster_dtype", "inference_linear", "linear"]
 
 # Multiply-adds below which the overhead of a call outweighs the faster kernel.
-_SMALL = 2**20
+_SMALL = 2**21
 # Rows from which on the fastest kernel stays the same.
 _ALIKE = 1024
 
@@ -49,8 +49,10 @@ def linear(value: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> T
         tensor([[0.],
                 [0.]])
     """
-    if value.numel() * len(weight) < _SMALL or not _has_choice(value, weight, bias):
-        return _plain(value, weight, bias, relu)
+    # The first condition is cheap, since it delays every small product.
+    if value.numel() * weight.shape[0] < _SMALL or not _has_choice(value, weight, bias):
+        out = F.linear(value, weight, bias)
+        return out.relu_() if relu else out
     rows = value if value.ndim == 2 else value.reshape(-1, value.shape[-1])
     has_grad = torch.is_grad_enabled()
     product = _Product.of(
@@ -89,17 +91,12 @@ def inference_linear(
         tensor([3.])
     """
     is_onednn = False
-    if rows * weight.numel() >= _SMALL and _has_choice(weight, bias):
-        product = _Product.of(rows, weight, "dense", relu)
+    if rows * weight.numel() >= _SMALL and _has_choice(weight, weight, bias):
+        product = _Product.of(rows, weight, "packed", relu)
         is_onednn = known_kernel(product, product.name, product.others) == "onednn"
-
-    def apply(value: Tensor) -> Tensor:
-        if not is_onednn:
-            return _plain(value, weight, bias, relu)
-        with through_onednn():
-            return _plain(value, weight, bias, relu)
-
-    return apply
+    if is_onednn:
+        return packed_linear(weight, bias, relu)
+    return partial(_plain, weight=weight, bias=bias, relu=relu)
 
 
 def faster_dtype(rows: int, width: int) -> torch.dtype:
@@ -144,7 +141,8 @@ class _Product(NamedTuple):
         rows (int): the number of rows, rounded down to a power of two.
         outputs (int): the number of outputs.
         inputs (int): the number of inputs.
-        layout (str): how the rows lie in memory, see :func:`_layout`.
+        layout (str): how the rows lie in memory, see :func:`_layout`; or ``"packed"``
+            for dense rows and a weight in oneDNN's layout.
         relu (bool): whether the positive part is taken.
         of_value (bool): whether there is a gradient of the input.
         of_weight (bool): whether there is one of weight and bias.
@@ -190,6 +188,12 @@ class _Product(NamedTuple):
     def others(self) -> dict[str, Callable[[], Any]]:
         """Returns calls that compute such a product, and its gradients."""
         operands = _operands(self.rows, self.inputs, self.outputs, self.layout)
+        value, weight, bias = operands
+        if self.layout == "packed":
+            return {
+                "plain": partial(_plain, *operands, self.relu),
+                "onednn": partial(packed_linear(weight, bias, self.relu), value),
+            }
         needed = (self.of_value, self.of_weight)
         return {
             "plain": _step(partial(_plain, relu=self.relu), operands, needed),
@@ -220,7 +224,7 @@ def _operands(
 
     if layout == "transposed":
         value = draw(inputs, rows).t()
-    elif layout == "dense":
+    elif layout in ("dense", "packed"):
         value = draw(rows, inputs)
     else:
         value = draw(rows, 2 * inputs)
@@ -252,15 +256,17 @@ def _step(
     return call
 
 
-def _has_choice(*operands: Tensor) -> bool:
+def _has_choice(value: Tensor, weight: Tensor, bias: Tensor) -> bool:
     """Returns whether another kernel than torch's may be faster."""
     return (
         # First: the compiler chooses its own kernels, and cannot trace the others.
         not torch.compiler.is_compiling()
-        and all(x.device.type == "cpu" and x.dtype == torch.float32 for x in operands)
+        and value.dtype is torch.float32
+        and value.device.type == "cpu"
         and onednn_has_float32()
         and not torch.is_autocast_enabled("cpu")
-        and not any(is_transformed(x) for x in operands)
+        and not (is_transformed(value) or is_transformed(weight))
+        and not is_transformed(bias)
     )
 
 

@@ -19,6 +19,7 @@ from torchrl_caiac._fingerprints import (
     state_leaves,
 )
 from torchrl_caiac._keys import missing_key
+from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flags
 from torchrl_caiac.transforms.checks import LateCheck
@@ -109,7 +110,7 @@ class BatchCheck:
             ValueError: a score is missing, infinite or that of another state; or the
                 rows of a window do not follow each other.
         """
-        known = td.get(self._fingerprint_key, None)
+        known = leaf_of(td, self._fingerprint_key)
         is_valid = crosses = None
         if self.window == 1:
             if known is not None:
@@ -156,7 +157,7 @@ class BatchCheck:
             ValueError: a value is not finite; on a CUDA device, also what
                 :meth:`before` raises elsewhere.
         """
-        leaves = [td.get(key) for key in states]
+        leaves = [leaf_of(td, key) for key in states]
         if not LateCheck.needed(checked.scores.device):
             if not math.isfinite(sum(leaf.sum().item() for leaf in leaves)):
                 self._explain_states(td, states)
@@ -240,7 +241,7 @@ class BatchCheck:
 
     def _crossings(self, td: TensorDictBase) -> torch.Tensor:
         """Returns where a window leaves its trajectory, bool ``[B, window - 1]``."""
-        if td.get(STEPS_KEY, None) is not None:
+        if leaf_of(td, STEPS_KEY) is not None:
             raise ValueError(
                 f"the batch has {STEPS_KEY!r}, so that its next states are several "
                 f"steps later, but windows of {self.window} rows are single steps: "
@@ -249,7 +250,7 @@ class BatchCheck:
         found = None
         ids = None
         if self.keys.trajectory is not None:
-            ids = td.get(self.keys.trajectory, None)
+            ids = leaf_of(td, self.keys.trajectory)
             if ids is None:
                 ids = td.get(COLLECTOR_KEY, None)
             if ids is not None:

@@ -9,12 +9,17 @@ from typing import Any, ClassVar, Literal, TypeVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import HERReplayBuffer, ReplayBuffer, TensorStorage
+from torchrl.data import (
+    HERReplayBuffer,
+    ReplayBuffer,
+    ReplayBufferEnsemble,
+    TensorStorage,
+)
 
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._keys import as_key
-from torchrl_caiac._torchrl import sampled_rows, sampling_buffer
+from torchrl_caiac._torchrl import leaf_of, sampled_rows, sampling_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import (
@@ -544,19 +549,21 @@ class CounterfactualTransform(RandomTransform, ABC):
                 f"{self.window}: sample slices of this length, e.g. SliceSampler("
                 f"slice_len={self.window}), and a batch size that is a multiple of it"
             )
-        if td.get(self.keys.relabeled, None) is not None:
+        if leaf_of(td, self.keys.relabeled) is not None:
             raise RuntimeError(
                 f"HindsightGoal relabelled this batch before {type(self).__name__}, so "
                 "that its goals would be swapped as if they were stored: append "
                 f"{type(self).__name__} first, HindsightGoal after it"
             )
-        scores = td.get(self.score_key, None)
+        scores = leaf_of(td, self.score_key)
         if scores is None:
             donors = self.donors_class
+            where = "on the replay buffer"
+            if isinstance(sampling_buffer(), ReplayBufferEnsemble):
+                where = "on each buffer of the ensemble"
             raise KeyError(
                 f"the batch has no {donors.scores_name} in {self.score_key!r}: call "
-                "score_buffer on the replay buffer, or name their key with "
-                f"{donors.key_argument}"
+                f"score_buffer {where}, or name their key with {donors.key_argument}"
             )
         expected = (td.shape[0], *self.feature_shape)
         if tuple(scores.shape) != expected:

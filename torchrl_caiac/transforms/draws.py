@@ -269,20 +269,20 @@ def draw_batch_donors(
     """
     count, entities = free.shape
     first = count - num_windows
-    free = free.t()
+    free = free.t().contiguous()
     tail = free[:, first:] if first else free
     is_chosen = _drawn(tail, swap_prob, chosen, generator)
-    # rank[n, b]: the number of free windows of entity n before window b, if that is
-    # free; last[n]: the rank of its last one, and so the number of donors.
-    rank = free.cumsum(1).sub_(1)
-    last, own = rank[:, -1:], rank[:, first:] if first else rank
-    place = draw_below(last.expand_as(own), generator=generator)
+    # rank[n, b]: the number of free windows of entity n up to and including window b.
+    rank = free.cumsum(1)
+    others, own = rank[:, -1:] - 1, rank[:, first:] if first else rank
+    place = draw_below(others.expand_as(own), generator=generator).add_(1)
     place = place + (place >= own)  # not the window itself
-    # listed[n, r]: the free window of rank r; the others end up in the last place.
+    # listed[n, r]: the free window of rank r, from 1; those that are not free end up
+    # at 0.
     starts = window_starts(count, window, free.device).expand(entities, -1)
-    listed = rank.new_zeros(entities, count + 1)
-    listed.scatter_(1, torch.where(free, rank, count), starts)
-    swapped = is_chosen & (last > 0)
+    listed = rank.new_zeros(entities, count + 2)
+    listed.scatter_(1, rank * free, starts)
+    swapped = is_chosen & (others > 0)
     return SwapDraw(
         listed.gather(1, place).t(),
         swapped.t(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -20,6 +20,11 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.influence.score_record import read_record
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows, trajectory_index
+from torchrl_caiac.trajectory_cache import (
+    TrajectoryTail,
+    record_writes,
+    written_tail,
+)
 from torchrl_caiac.transforms.checks import LateCheck
 from torchrl_caiac.transforms.indexing import pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -197,12 +202,31 @@ def hold_entities(scores: torch.Tensor, locked: torch.Tensor) -> torch.Tensor:
     return held
 
 
+class _Built(NamedTuple):
+    """A table, and what it was built from.
+
+    Attributes:
+        revision (tuple): the revision of the storage.
+        trajectories (TrajectoryIndex or TrajectoryTail): the trajectories.
+        table (torch.Tensor): ``[capacity, N]``.
+        own (int): the later states in each score.
+        competing (torch.Tensor): bool ``[N]``.
+    """
+
+    revision: tuple[Any, ...]
+    trajectories: TrajectoryIndex | TrajectoryTail
+    table: torch.Tensor
+    own: int
+    competing: torch.Tensor
+
+
 class Lookahead:
     """The entities that stored rows lock, computed when their buffer is first sampled.
 
-    The table has one byte for each row and entity, or two with the rule ``"goal"``. It
-    is built again after each write to the storage. A row whose score is missing, or
-    that of another state, counts as influenced.
+    The table has one byte for each row and entity, or two with the rule ``"goal"``.
+    After rows were added at the end, or have replaced the oldest ones, it is computed
+    again for the trajectories that were written to; after any other write, for all. A
+    row whose score is missing, or that of another state, counts as influenced.
 
     Args:
         rule (int or str): see :func:`locked_entities`; with ``"goal"`` batches have the
@@ -237,7 +261,7 @@ class Lookahead:
 
     def refresh(self) -> None:
         """Drops the tables, so that they are built again."""
-        self._tables: weakref.WeakKeyDictionary[Any, tuple[Any, torch.Tensor]] = (
+        self._tables: weakref.WeakKeyDictionary[Any, _Built] = (
             weakref.WeakKeyDictionary()
         )
         self._seen = threading.local()  # the revision at the last batch of a thread
@@ -257,29 +281,35 @@ class Lookahead:
             TypeError: the storage does not contain a tensordict.
             ValueError: the scores look further ahead than the rule.
         """
+        with _BUILDING, writes_paused(source):
+            return self._table(source).clone()
+
+    def _table(self, source: ReplayBuffer | TensorStorage) -> torch.Tensor:
+        """Returns the table, which the next write may change, within the lock."""
         storage = source.storage if isinstance(source, ReplayBuffer) else source
         data = storage_rows(storage, "the storage of the buffer that samples")
-        with _BUILDING, writes_paused(source):
-            revision = storage_revision(storage)
-            built = self._tables.get(storage)
-            if built is None or built[0] != revision:
-                built = revision, self._build(source, storage, data)
-                self._tables[storage] = built
-            return built[1]
+        revision = storage_revision(storage)
+        built = self._tables.pop(storage, None)  # of which an error leaves nothing
+        if built is None or built.revision != revision:
+            built = self._build(source, storage, data, built)._replace(
+                revision=revision
+            )
+        self._tables[storage] = built
+        return built.table[: len(storage)]
 
     def _build(
         self,
         source: ReplayBuffer | TensorStorage,
         storage: TensorStorage,
         data: TensorDictBase,
-    ) -> torch.Tensor:
+        before: _Built | None,
+    ) -> _Built:
         if data.get(self.score_key, None) is None:
             raise KeyError(
                 f"lookahead={self.rule!r} reads {self.score_key!r} of all rows of the "
                 "storage, which lacks them: store them with score_buffer, or leave out "
                 "lookahead"
             )
-        scores = valid_scores(data, self.score_key, self.layout, len(storage))
         record = read_record(storage, data, self.score_key)
         own = 0 if record is None else int(record["settings"]["lookahead"])
         if isinstance(self.rule, int) and self.rule < own:
@@ -288,35 +318,72 @@ class Lookahead:
                 f"contain those of {own} later states: pass at least lookahead={own}, "
                 "or score with score_buffer(..., lookahead=0)"
             )
-        trajectories = trajectory_index(
-            source, trajectory_key=self.keys.trajectory, done_key=self.keys.done
+        competing = self._competes = self._competing().to(
+            data.get(self.score_key).device
         )
-        competing = self._competes = self._competing().to(scores.device)
-        dtype = torch.int16 if self.rule == "goal" else torch.bool
+        keys = {"trajectory_key": self.keys.trajectory, "done_key": self.keys.done}
+        is_same = before is not None and before.own == own
+        if before is not None and is_same and torch.equal(before.competing, competing):
+            tail = written_tail(before.trajectories, before.revision, source, **keys)
+            if tail is not None:
+                built = before._replace(trajectories=tail)
+                position = torch.arange(tail.start, tail.length)
+                scores = self._scores(data, tail.rows(position))
+                self._fill(built, scores, tail.start)
+                return built
+        record_writes(storage)
+        scores = valid_scores(data, self.score_key, self.layout, len(storage))
         table = torch.empty(
-            len(scores), len(self.layout), dtype=dtype, device=scores.device
+            len(data),  # later rows have their place
+            len(self.layout),
+            dtype=torch.int16 if self.rule == "goal" else torch.bool,
+            device=scores.device,
         )
-        # Whole trajectories at a time, on which no others depend.
+        built = _Built((), trajectory_index(source, **keys), table, own, competing)
+        self._fill(built, scores, None)
+        return built
+
+    def _scores(self, data: TensorDictBase, rows: torch.Tensor) -> torch.Tensor:
+        """Returns the scores of rows, as :func:`valid_scores` does."""
+        states = self.layout.in_keys
+        part = data.select(
+            self.score_key,
+            fingerprint_key(self.score_key),
+            *states,
+            *(self.layout.next(key) for key in states),
+            strict=False,
+        )[rows.to(data.device or "cpu")]
+        return valid_scores(part, self.score_key, self.layout, len(rows))
+
+    def _fill(self, built: _Built, scores: torch.Tensor, first: int | None) -> None:
+        """Fills the table, of whole trajectories at a time, as no others depend on one.
+
+        Args:
+            built (_Built): the table, and the trajectories.
+            scores (torch.Tensor): the scores, by row, or in the order of time.
+            first (int, optional): the position of the first ones in the order of time,
+                where to begin.
+        """
+        index, table = built.trajectories, built.table
         size = max(1, _CHUNK // scores[0].numel())
-        ends, start = trajectories.ends.cpu(), 0
-        while start < trajectories.length:
-            at = torch.searchsorted(ends, min(start + size, trajectories.length) - 1)
+        ends, start = index.ends.cpu(), first or 0
+        while start < index.length:
+            at = torch.searchsorted(ends, min(start + size, index.length) - 1)
             stop = int(ends[at]) + 1
-            position = torch.arange(start, stop, device=trajectories.device)
-            rows = trajectories.rows(position)
-            left = trajectories.remaining(rows).to(scores.device)
-            rows = rows.to(scores.device)
-            parts = rows.split(size)  # of a long trajectory
+            position = torch.arange(start, stop, device=index.ends.device)
+            end = index.ends[torch.searchsorted(index.ends, position)]
+            rows = index.rows(position).to(table.device)
+            own = rows if first is None else (position - first).to(table.device)
+            parts = own.split(size)  # of a long trajectory
             influenced = torch.cat([~self._free(scores[part]) for part in parts])
-            steps = _steps(influenced, left)
-            steps += own * ((steps > 0) & (steps < NEVER))
+            steps = _steps(influenced, (end - position).to(table.device))
+            steps += built.own * ((steps > 0) & (steps < NEVER))
             if self.rule == "goal":
                 steps = steps.clamp(max=_MOST).where(steps < NEVER, _MOST + 1)
-                table[rows] = steps.to(dtype)
+                table[rows] = steps.to(table.dtype)
             else:
-                table[rows] = locked_entities(steps, self.rule, competing)
+                table[rows] = locked_entities(steps, self.rule, built.competing)
             start = stop
-        return table
 
     def locked(
         self, source: ReplayBuffer, index: Any, drawn: Any, batch: TensorDictBase
@@ -366,7 +433,7 @@ class Lookahead:
                 "others that select, repeat or reorder rows, or leave out lookahead"
             )
         with _BUILDING, writes_paused(source):  # no write between table and rows
-            found = pick_rows(self.table(source), rows).to(device)
+            found = pick_rows(self._table(source), rows).to(device)
             keys = own if self.keys.trajectory is None else (*own, self.keys.trajectory)
             replaced = _differing(batch, storage_rows(storage), keys, rows)
             revision = storage_revision(storage)

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import flatten
+from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import STEPS_KEY
 from torchrl_caiac.transforms.checks import LateCheck
@@ -244,7 +245,7 @@ class GoalLeaves:
                 a reward is NaN or infinite, or the rewards are sums over several steps.
         """
         keys = self.keys
-        if td.get(STEPS_KEY, None) is not None:
+        if leaf_of(td, STEPS_KEY) is not None:
             raise ValueError(
                 f"the batch has {STEPS_KEY!r}, so that {keys.reward!r} is a sum of "
                 "rewards over several steps, but reward_fn and terminated_fn see the "
@@ -404,7 +405,7 @@ def stored_reward(td: TensorDictBase, reward_key: NestedKey) -> torch.Tensor:
         KeyError: there are none.
         ValueError: there is not one for each row.
     """
-    reward = td.get(reward_key, None)
+    reward = leaf_of(td, reward_key)
     if reward is None:
         raise KeyError(
             f"reward_fn is given, but the batch has no {reward_key!r}: name the "

@@ -22,7 +22,7 @@ from tensordict import (
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join
-from torchrl_caiac._torchrl import with_leaves
+from torchrl_caiac._torchrl import leaf_of, with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.transforms.draws import SwapDraw
@@ -126,7 +126,7 @@ class SwapPlanner:
             ValueError: a leaf has the wrong width.
             TypeError: an entity contains something other than tensors.
         """
-        found: list[Any] = [td.get(source.key, None) for source in self._sources]
+        found: list[Any] = [leaf_of(td, source.key) for source in self._sources]
         keys: list[tuple[NestedKey, _Source]] = []
         if self.layout.is_flat:
             signature: Hashable = tuple(map(_signature, found))
@@ -147,6 +147,7 @@ class SwapPlanner:
         layout = self.layout
         leaves: list[SwapLeaf] = []
         owners: dict[Hashable, tuple[int, torch.Tensor]] = {}
+        has_rest = False
         for place, (source, value) in enumerate(zip(self._sources, found, strict=True)):
             if source.is_required and not isinstance(value, torch.Tensor):
                 layout.check(td, next=True)  # raises
@@ -180,6 +181,7 @@ class SwapPlanner:
                     if source.kind == "state"
                     else layout.goal_column_entity()
                 )
+                has_rest |= bool((owner < 0).any())
                 owner = torch.where(owner < 0, len(layout), owner)
                 owners[kind] = len(owners), owner.to(value.device)
             group, owner = owners[kind]
@@ -191,8 +193,6 @@ class SwapPlanner:
             for source, value in zip(self._sources, found, strict=True)
             if source.kind == "state" and value.is_floating_point()
         ]
-        rest = len(layout)
-        has_rest = any(bool((owner == rest).any()) for _, owner in owners.values())
         return SwapPlan(tuple(leaves), tuple(states), has_rest)
 
     def _plan(
@@ -362,7 +362,7 @@ def apply_swap(
     first = td.shape[0] - changed * window
     if sources is None:
         starts = window_starts(len(td) // window, window, draw.swapped.device)
-        own = starts[-changed:].unsqueeze(-1)
+        own = (starts[-changed:] if first else starts).unsqueeze(-1)
     elif has_own:
         own = window_starts(changed, window, draw.swapped.device).unsqueeze(-1)
     else:
@@ -374,6 +374,9 @@ def apply_swap(
     if trajectories is not None:
         steps = torch.arange(window, device=rows.device).view(-1, 1)
         rows = trajectories.later(rows.unsqueeze(1), steps)
+    length = td.shape[0] if sources is None else max(map(len, sources), default=0)
+    if length * max((leaf.width for leaf in plan.leaves), default=0) < 1 << 31:
+        rows = rows.int()  # half as much to write and to read
     places: dict[int, torch.Tensor] = {}
     masks: dict[tuple[int, int], torch.Tensor] = {}
     leaves: dict[NestedKey, torch.Tensor] = {}
@@ -385,7 +388,7 @@ def apply_swap(
         else:
             source = value if sources is None else sources[number]
             if leaf.group not in places:
-                found = _places(rows, leaf, window, len(source))
+                found = _places(rows, leaf, window)
                 places[leaf.group] = found.to(source.device)
             new = _read(source, places[leaf.group], leaf)
         if not is_complete:
@@ -408,34 +411,29 @@ def _inside(
     return places.view(window, width)
 
 
-def _places(
-    rows: torch.Tensor, leaf: SwapLeaf, window: int, length: int
-) -> torch.Tensor:
-    """Finds the values of each donor window in a source of ``length`` rows.
+def _places(rows: torch.Tensor, leaf: SwapLeaf, window: int) -> torch.Tensor:
+    """Finds the values of each donor window in a source.
 
     Args:
         rows (torch.Tensor): the first row of each entity's donor window, ``[C, N]``, or
             all of its rows, ``[C, window, N]``.
         leaf (SwapLeaf): what is read.
         window (int): rows in a window.
-        length (int): rows of the source.
 
     Returns:
         torch.Tensor: rows ``[C * window]`` for one entity's leaf; for columns, places
         ``[C * window * D]`` in the source as one vector.
     """
-    if length * leaf.width < 1 << 31:  # half as much to write and to read
-        rows = rows.int()
     if isinstance(leaf.owner, int):
         place = rows[..., leaf.owner : leaf.owner + 1]
     else:
         owner = leaf.owner.to(rows.device)
         place = rows.gather(-1, owner.expand(*rows.shape[:-1], -1))
     if rows.ndim == 3:
-        inside = _inside(1, leaf.width, rows.device, place.dtype)
-    else:
-        inside = _inside(window, leaf.width, rows.device, place.dtype)
+        window = 1
+    elif window > 1:
         place = place.unsqueeze(1)
+    inside = _inside(window, leaf.width, rows.device, place.dtype)
     return torch.add(inside, place, alpha=leaf.width).flatten()
 
 

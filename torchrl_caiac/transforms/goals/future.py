@@ -15,9 +15,10 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_below, draw_numbers
-from torchrl_caiac._torchrl import sampling_buffer, storage_rows
+from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.trajectories import TrajectoryCache, TrajectoryIndex
+from torchrl_caiac.trajectories import TrajectoryIndex
+from torchrl_caiac.trajectory_cache import TrajectoryCache
 from torchrl_caiac.transforms.checks import check_generator, check_layout
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -231,7 +232,7 @@ class FutureGoal(RandomTransform, SampleUnit):
             ValueError: it has too few columns.
         """
         key, columns = self._goal_columns
-        source = data.get(key, None)
+        source = leaf_of(data, key)
         if source is None:
             raise missing_key(
                 data,

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import floating
 from torchrl_caiac._random import draw_numbers
-from torchrl_caiac._torchrl import with_leaves
+from torchrl_caiac._torchrl import leaf_of, with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_number
@@ -296,7 +296,7 @@ class HindsightGoal(FutureGoal):
     def _desired(
         self, td: TensorDictBase, key: NestedKey, achieved: torch.Tensor
     ) -> torch.Tensor:
-        desired = td.get(key, None)
+        desired = leaf_of(td, key)
         if desired is None:
             raise KeyError(
                 f"the batch has no desired goals in {key!r}: store them, or correct "
@@ -313,7 +313,7 @@ class HindsightGoal(FutureGoal):
     def _relabel(self, td: TensorDictBase, draw: HindsightDraw) -> Goals:
         """Returns the leaves that a draw changes or adds."""
         relabeled = (draw.source >= td.shape[0]).unsqueeze(-1)
-        flags = td.get(self.keys.counterfactual, None)
+        flags = leaf_of(td, self.keys.counterfactual)
         achieved = self.read_goals(td)
         goals: Goals = {}
         for key, reached in achieved.items():
@@ -332,7 +332,7 @@ class HindsightGoal(FutureGoal):
         after = {self.layout.next(key): goal for key, goal in goals.items()}
         return {
             **goals,
-            **{k: goal for k, goal in after.items() if td.get(k, None) is not None},
+            **{k: goal for k, goal in after.items() if leaf_of(td, k) is not None},
             **leaves,
             self.keys.relabeled: relabeled,
         }
@@ -393,12 +393,12 @@ class HindsightGoal(FutureGoal):
                         f"batch has {rows}: append HindsightGoal before transforms "
                         "that change the batch size"
                     )
-        if tensordict.get(self.keys.relabeled, None) is not None:
+        if leaf_of(tensordict, self.keys.relabeled) is not None:
             raise RuntimeError(
                 f"the batch is already relabelled, see {self.keys.relabeled!r}: "
                 "append one HindsightGoal only"
             )
-        flags = tensordict.get(self.keys.counterfactual, None)
+        flags = leaf_of(tensordict, self.keys.counterfactual)
         if flags is not None and flags.shape != (rows, 1):
             raise ValueError(
                 f"{self.keys.counterfactual!r} has shape {list(flags.shape)}, expected "
