@@ -81,10 +81,12 @@ def touched(tree, own):
 
 # Of gymnasium-robotics, OGBench and Python.
 ALLOWED = {
+    "before._replace",
     "checked._replace",
     "draw._replace",
     "options._asdict",
     "os._exit",
+    "self._build(source, storage, data, built)._replace",
     "split._replace",
     # What OGBench's controller and buttons depend on has no public name.
     "self._task._cur_button_states",
