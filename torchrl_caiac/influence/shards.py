@@ -40,6 +40,7 @@ __all__ = [
 ]
 
 _logger = logging.getLogger("torchrl_caiac.influence.score_buffer")
+_MOST_JOINS = 3
 _LEAST_WAIT, _MOST_WAIT = 0.02, 1.0
 
 
@@ -132,10 +133,17 @@ def score_shard(
             own.scorer.feature_shape = tuple(plan.feature_shape)
             _work(own, parts, plan, shard, progress=progress)
             with parts.leading():
-                while parts.is_current(plan) and not joined:
+                for _ in range(_MOST_JOINS):
+                    if joined or not parts.is_current(plan):
+                        break
                     joined = _join(own, parts, plan)
                     if not joined:  # a file was damaged
                         _work(own, parts, plan, shard, progress=False)
+                else:
+                    raise RuntimeError(
+                        f"scores were damaged again after {_MOST_JOINS} tries: delete "
+                        f"{parts.root}, check the disk, and call score_buffer again"
+                    )
     _open_leaves(own)
     record = own.read_record()
     if record is None or record["state"] != "scored":
