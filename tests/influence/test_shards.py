@@ -9,6 +9,7 @@ import resource
 import signal
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +144,19 @@ def test_clocks_that_are_wrong_stop_nobody(seconds: int, tmp_path: Path) -> None
     (parts / f"{plan}-abc.npz").touch()  # of another program
     score(tmp_path / "rows")
     assert leaf_bytes(tmp_path / "rows") == leaf_bytes(whole)
+
+
+def test_scored_folders_may_be_read_only(
+    tmp_path: Path, read_only: Callable[[Path], None]
+) -> None:
+    for name in ("scored", "other"):
+        episodes((30, 20)).memmap(tmp_path / name)
+    score(tmp_path / "scored")
+    for name in ("scored", "other"):
+        read_only(tmp_path / name)
+    score(tmp_path / "scored")
+    with pytest.raises(OSError, match=str(tmp_path / "other")):
+        score(tmp_path / "other")
 
 
 def test_a_full_disk_is_named_and_the_call_goes_on(tmp_path: Path) -> None:

@@ -17,7 +17,12 @@ from tqdm.auto import tqdm
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._torchrl import add_revision, forget_leaves, storage_data
 from torchrl_caiac.data.add_leaf import open_leaf
-from torchrl_caiac.influence.score_leaf import ScoreLeaves, find_leaves, new_leaves
+from torchrl_caiac.influence.score_leaf import (
+    RowStates,
+    ScoreLeaves,
+    find_leaves,
+    new_leaves,
+)
 from torchrl_caiac.influence.score_parts import Plan, ScoreParts, new_plan
 from torchrl_caiac.influence.score_pass import (
     ScorePass,
@@ -123,6 +128,8 @@ def score_shard(
             "with offline_buffer(load_transitions(folder)), or leave out shard"
         )
     parts = ScoreParts.of(own.folder, own.key)
+    if not parts.root.exists() and _is_scored(own):
+        return False  # before anything is locked, as the folder may be read-only
     joined = False
     with parts.taking_part():
         with parts.leading():
@@ -152,6 +159,23 @@ def score_shard(
             "removed what was scored: call score_buffer again"
         )
     return joined
+
+
+def _is_scored(own: ScorePass) -> bool:
+    """Returns whether a finished call with the same settings has scored all rows."""
+    record = own.read_record()
+    if record is None or (record["state"], record["settings"]) != (
+        "scored",
+        own.settings,
+    ):
+        return False
+    _open_leaves(own)
+    found = existing_scores(own)
+    return found is not None and _nothing_left(found[1])
+
+
+def _nothing_left(states: RowStates) -> bool:
+    return bool((states.valid & ~states.moved).all())
 
 
 def has_parts(own: ScorePass) -> bool:
@@ -224,7 +248,7 @@ def _begin(
         new_leaves(own.storage, own.key, shape)
     else:
         leaves, states, is_first = found
-        if bool((states.valid & ~states.moved).all()):
+        if _nothing_left(states):
             if is_first:
                 own.write_record("scored")
             return None
