@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import resource
+import signal
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -81,3 +89,89 @@ def test_any_split_and_interruption_gives_the_bytes_of_one_process(
         if every == 1:
             expected = definition(rows, square, smoothing, lookahead)
             torch.testing.assert_close(scores(rb), expected, atol=1e-6, rtol=1e-6)
+
+
+def interrupted(folder: Path) -> Path:
+    """Scores a part of the rows, and returns the folder of the parts."""
+    episodes((30, 20, 50)).memmap(folder)
+    with pytest.raises(KeyboardInterrupt):
+        score(folder, 6)
+    return folder / PARTS
+
+
+def score(folder: Path, calls: int = -1) -> None:
+    settings = {"shard": (0, 2), "check": False, "progress": False}
+    score_buffer(opened(folder), Failing(calls), 4, **settings)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rows": [1]},
+        {"rows": "x"},
+        {"rows": [4] * 24 + ["4"]},
+        {"rows": [4] * 26},
+        {"chunks": 0},
+        {"chunks": "1"},
+        {"chunks": 2},
+        {"feature_shape": "ab"},
+        {"geometry": {}},
+        {"settings": None},
+        {"name": "../x"},
+    ],
+    ids=str,
+)
+def test_a_damaged_plan_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
+    plan = interrupted(tmp_path / "rows") / "plan.json"
+    plan.write_text(json.dumps({**json.loads(plan.read_text()), **change}))
+    with pytest.raises(ValueError, match=r"is not a plan of scoring: delete .*parts"):
+        score(tmp_path / "rows")
+
+
+@pytest.mark.parametrize("seconds", [-3600, 3600])
+def test_clocks_that_are_wrong_stop_nobody(seconds: int, tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    episodes((30, 20, 50)).memmap(whole)
+    score(whole)
+    parts = interrupted(tmp_path / "rows")
+    name = "deadbeef-77-aaaaaaaa"  # of another machine
+    for claim in parts.glob("*.claim"):
+        claim.write_text(name)
+    member = parts / f"{name}.member"
+    member.write_text("{}")
+    os.utime(member, (time.time() + seconds,) * 2)
+    plan = json.loads((parts / "plan.json").read_text())["name"]
+    (parts / f"{plan}-abc.npz").touch()  # of another program
+    score(tmp_path / "rows")
+    assert leaf_bytes(tmp_path / "rows") == leaf_bytes(whole)
+
+
+def test_scored_folders_may_be_read_only(
+    tmp_path: Path, read_only: Callable[[Path], None]
+) -> None:
+    for name in ("scored", "other"):
+        episodes((30, 20)).memmap(tmp_path / name)
+    score(tmp_path / "scored")
+    for name in ("scored", "other"):
+        read_only(tmp_path / name)
+    score(tmp_path / "scored")
+    with pytest.raises(OSError, match=str(tmp_path / "other")):
+        score(tmp_path / "other")
+
+
+def test_a_full_disk_is_named_and_the_call_goes_on(tmp_path: Path) -> None:
+    folder = tmp_path / "rows"
+    parts = interrupted(folder)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))
+    try:
+        with pytest.raises(OSError, match="repeat the call") as caught:
+            score(folder)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert caught.value.errno == errno.ENOSPC
+    assert not list(parts.glob(".part-*"))
+    score(folder)
+    assert not parts.exists()

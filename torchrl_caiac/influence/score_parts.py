@@ -15,6 +15,7 @@ range, for example because one of them was suspended, both write the same bytes.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import platform
@@ -244,7 +245,8 @@ class ScoreParts:
                 last = os.fstat(stream.fileno()).st_mtime
         except OSError:
             return False
-        return self._now() - last < _SECONDS_WITHOUT_SIGN
+        # A sign from the future is one before the clock was set back.
+        return abs(self._now() - last) < _SECONDS_WITHOUT_SIGN
 
     def _now(self) -> float:
         """Returns the time of the file system, whose clock may be another."""
@@ -274,8 +276,10 @@ class ScoreParts:
             return None
         try:
             if content.pop("version") == _VERSION:
-                return Plan(**content)
-        except (AttributeError, KeyError, TypeError):
+                plan = Plan(**content)
+                if _is_consistent(plan):
+                    return plan
+        except (AttributeError, KeyError, TypeError, ValueError):
             pass
         raise UnreadableFileError(f"{file} is not a plan of scoring: {remedy}")
 
@@ -380,15 +384,24 @@ class ScoreParts:
             fingerprints (torch.Tensor): int64 ``[n]``.
         """
         partial = self.root / f".part-{self.member}"
-        with suppress(FileNotFoundError):  # another process has finished all of it
-            try:
-                with open(partial, "wb") as stream:
-                    np.savez(
-                        stream, scores=scores.numpy(), fingerprints=fingerprints.numpy()
-                    )
-                os.replace(partial, self._part(plan, number))
-            finally:
-                partial.unlink(missing_ok=True)
+        try:
+            with open(partial, "wb") as stream:
+                np.savez(
+                    stream, scores=scores.numpy(), fingerprints=fingerprints.numpy()
+                )
+            os.replace(partial, self._part(plan, number))
+        except FileNotFoundError:  # another process has finished all of it
+            pass
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+                raise
+            raise OSError(
+                errno.ENOSPC,
+                f"the disk is full: scores in {self.root} need {scores.nbytes} bytes "
+                "more; what is scored is kept, make space and repeat the call",
+            ) from error
+        finally:
+            partial.unlink(missing_ok=True)
 
     def get(self, plan: Plan, number: int) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Returns what :meth:`put` wrote.
@@ -436,11 +449,25 @@ class ScoreParts:
 
     def _numbers(self, plan: Plan, suffix: str) -> set[int]:
         start = f"{plan.name}-"
-        return {
-            int(file.name[len(start) : -len(suffix)])
-            for file in self._all(suffix)
-            if file.name.startswith(start)
-        }
+        names = [file.name.removesuffix(suffix) for file in self._all(suffix)]
+        numbers = [x.removeprefix(start) for x in names if x.startswith(start)]
+        return {int(number) for number in numbers if number.isdecimal()}
+
+
+def _is_consistent(plan: Plan) -> bool:
+    """Returns whether the ranges are those of the rows; raises for other types."""
+    numbers = [plan.chunks, *plan.rows, *plan.feature_shape]
+    length, size = plan.geometry["rows"], plan.chunks * plan.geometry["batch_size"]
+    full = [min(size, length - start) for start in range(0, length, size)]
+    return (
+        all(type(number) is int and number >= 0 for number in numbers)
+        and type(plan.has_mask) is bool
+        and isinstance(plan.settings, dict)
+        and plan.name.isalnum()
+        and len(plan.rows) == len(full)
+        and all(n <= most for n, most in zip(plan.rows, full, strict=True))
+        and (plan.has_mask or plan.rows == full)
+    )
 
 
 def _choice(number: int, taken: set[int], first: int) -> int | None:

@@ -17,7 +17,12 @@ from tqdm.auto import tqdm
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._torchrl import add_revision, forget_leaves, storage_data
 from torchrl_caiac.data.add_leaf import open_leaf
-from torchrl_caiac.influence.score_leaf import ScoreLeaves, find_leaves, new_leaves
+from torchrl_caiac.influence.score_leaf import (
+    RowStates,
+    ScoreLeaves,
+    find_leaves,
+    new_leaves,
+)
 from torchrl_caiac.influence.score_parts import Plan, ScoreParts, new_plan
 from torchrl_caiac.influence.score_pass import (
     ScorePass,
@@ -40,6 +45,7 @@ __all__ = [
 ]
 
 _logger = logging.getLogger("torchrl_caiac.influence.score_buffer")
+_MOST_JOINS = 3
 _LEAST_WAIT, _MOST_WAIT = 0.02, 1.0
 
 
@@ -122,6 +128,8 @@ def score_shard(
             "with offline_buffer(load_transitions(folder)), or leave out shard"
         )
     parts = ScoreParts.of(own.folder, own.key)
+    if not parts.root.exists() and _is_scored(own):
+        return False  # before anything is locked, as the folder may be read-only
     joined = False
     record = own.read_record()
     if record is None or record["state"] != "scored":
@@ -136,10 +144,17 @@ def score_shard(
             own.scorer.feature_shape = tuple(plan.feature_shape)
             _work(own, parts, plan, shard, progress=progress)
             with parts.leading():
-                while parts.is_current(plan) and not joined:
+                for _ in range(_MOST_JOINS):
+                    if joined or not parts.is_current(plan):
+                        break
                     joined = _join(own, parts, plan)
                     if not joined:  # a file was damaged
                         _work(own, parts, plan, shard, progress=False)
+                else:
+                    raise RuntimeError(
+                        f"scores were damaged again after {_MOST_JOINS} tries: delete "
+                        f"{parts.root}, check the disk, and call score_buffer again"
+                    )
     _open_leaves(own)
     record = own.read_record()
     if record is None or record["state"] != "scored":
@@ -148,6 +163,23 @@ def score_shard(
             "removed what was scored: call score_buffer again"
         )
     return joined
+
+
+def _is_scored(own: ScorePass) -> bool:
+    """Returns whether a finished call with the same settings has scored all rows."""
+    record = own.read_record()
+    if record is None or (record["state"], record["settings"]) != (
+        "scored",
+        own.settings,
+    ):
+        return False
+    _open_leaves(own)
+    found = existing_scores(own)
+    return found is not None and _nothing_left(found[1])
+
+
+def _nothing_left(states: RowStates) -> bool:
+    return bool((states.valid & ~states.moved).all())
 
 
 def has_parts(own: ScorePass) -> bool:
@@ -221,7 +253,7 @@ def _begin(
         new_leaves(own.storage, own.key, shape)
     else:
         leaves, states, is_first = found
-        is_done = bool((states.valid & ~states.moved).all())
+        is_done = _nothing_left(states)
         if is_done and not is_first:
             return None
         own.keep_kernels(own.read_record())
