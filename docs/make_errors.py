@@ -1,4 +1,4 @@
-"""Lists every error message of the package, from its source.
+"""Lists every error and warning of the package, from its source.
 
 ``conf.py`` writes the page at each build, so that the search of the site finds them.
 """
@@ -27,8 +27,8 @@ STEPS = {
 HEAD = """\
 # All error messages
 
-Every error that the package raises, by step, as its source has it: `…` stands for names
-and numbers of your data. Search for the words of a message that do not change.
+Every error and warning of the package, by step, as its source has it: `…` stands for
+names and numbers of your data. Search for the words of a message that do not change.
 {doc}`/faq` explains those that many users meet.
 
 """
@@ -48,17 +48,19 @@ def text_of(node: ast.expr) -> str:
 
 
 def messages(path: Path) -> list[tuple[str, str]]:
-    """Returns the kinds and messages of all errors that a module raises."""
+    """Returns the kinds and messages of all errors and warnings of a module."""
     found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Raise):
-            node = node.exc
         if not (isinstance(node, ast.Call) and node.args):
             continue
         kind = ast.unparse(node.func).rsplit(".", 1)[-1]
-        if not re.fullmatch(r"[A-Z]\w*(Error|Unavailable)", kind):
+        arguments = node.args
+        if kind in ("warn", "warning"):
+            kind, arguments = "Warning", node.args[:1]
+        elif not re.fullmatch(r"[A-Z]\w*(Error|Unavailable)", kind):
             continue
-        text = " ".join(" ".join(map(text_of, node.args)).split())
+        text = " ".join(" ".join(map(text_of, arguments)).split())
+        text = re.sub(r"%[ds]|%\.?\d*f", "…", text)
         if len(re.findall(r"\w{3,}", text)) > 1:
             found.append((kind, text))
     return found

@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import re
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
 from sphinx.util import logging
 
 import torchrl_caiac
@@ -31,6 +33,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Registers mathematics without scripts, and the bases of classes."""
     app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
     app.connect("autodoc-process-bases", _public_bases)
+    app.connect("autodoc-process-docstring", _describe_constant)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -55,6 +58,30 @@ def _inline(translator: Any, node: nodes.math) -> None:
 def _display(translator: Any, node: nodes.math_block) -> None:
     translator.body.append(f'<div class="math">{_mathml(node, True)}</div>\n')
     raise nodes.SkipNode
+
+
+# --- the reference: constants, whose comments are where they are defined --------------
+
+
+def _comments() -> dict[str, list[str]]:
+    found = {}
+    for path in Path(torchrl_caiac.__file__).parent.rglob("*.py"):
+        module = ModuleAnalyzer.for_string(path.read_text(encoding="utf-8"), path.stem)
+        for (_, name), lines in module.find_attr_docs().items():
+            if name.isupper():
+                found[name] = lines
+    return found
+
+
+_COMMENTS = _comments()
+
+
+def _describe_constant(
+    app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]
+) -> None:
+    """Replaces the docstring of a constant, which is that of its type."""
+    if what == "data":
+        lines[:] = _COMMENTS.get(name.rsplit(".", 1)[-1], [])
 
 
 # --- the reference: bases that readers can look up -----------------------------------
