@@ -171,6 +171,7 @@ def main() -> None:
             for line in (one, two):
                 line["speed_up"] = round(one["seconds"] / line["seconds"], 2)
                 line["rate_up"] = round(line["rows_per_s"] / one["rows_per_s"], 2)
+                print(line)
             for file in ("score.memmap", "score_fingerprint.memmap"):
                 same = [
                     Path(root, f"{name}{n}", "caiac", file).read_bytes() for n in (1, 2)
