@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
+import logging
 import os
 import subprocess
 import sys
@@ -75,6 +76,7 @@ def rate(data: TensorDict, width: int, batch: int, work: int, way: str) -> float
 def measure(out: Path, work: int) -> None:
     """Measures in a process of ``torchrun``; that of rank 0 writes the table."""
     distributed.init_process_group("gloo")
+    logging.getLogger("torchrl_caiac").setLevel(logging.ERROR)  # short fits are bad
     data = rows_of(ROWS)
     table = []
     for width, batch in itertools.product(WIDTHS, BATCHES):

@@ -30,7 +30,7 @@ __all__ = [
 MAX_ENTITIES = 64
 
 # Rows, and elements of graphs, that are read together while an index is built.
-_CHUNK_ROWS = 1 << 20
+_CHUNK_ROWS = 1 << 17
 _CHUNK_ELEMENTS = 1 << 24
 
 
@@ -299,7 +299,7 @@ def component_starts(
 
     All rows of such a window belong to one trajectory, and in none of them the
     component contains the action or a fixed entity. The index takes 4 bytes for each
-    pair of row and component, and 24 while it is built.
+    pair of row and component, and at most 8 while it is built.
 
     Args:
         graphs (torch.Tensor): ``[T, N + 1, N]``, NaN where a row was not scored.
@@ -330,8 +330,7 @@ def component_starts(
     dtype = torch.int32 if length < 1 << 31 else torch.int64
     never = _packed(fixed.to(device))
     step = min(_CHUNK_ROWS, max(window, _CHUNK_ELEMENTS // (entities * (entities + 1))))
-    masks = [torch.empty(0, dtype=torch.int64, device=device)]
-    starts = [torch.empty(0, dtype=dtype, device=device)]
+    parts: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
     for rows, part in scan_donors(graphs, step, window, trajectories, "graphs"):
         links, held = _links(part, threshold)
         joined = _joined(_slid(links, window), _slid(held, window) | never)
@@ -339,14 +338,29 @@ def component_starts(
         leads = _leads(joined)
         if window > 1 and trajectories is not None:
             leads &= (trajectories.remaining(rows) >= window - 1).unsqueeze(-1)
-        masks.append(joined[leads])
-        starts.append(rows.to(dtype).unsqueeze(-1).expand_as(leads)[leads])
-    found, order = torch.cat(masks).sort(stable=True)
-    rows = torch.cat(starts)[order]
-    if not len(found):  # the index needs at least one component; 0 is none
-        found, rows = found.new_zeros(1), rows.new_zeros(1)
-    unique, size = torch.unique_consecutive(found, return_counts=True)
-    return ComponentIndex(unique, rows, size.cumsum(0) - size, size)
+        found, order = joined[leads].sort(stable=True)
+        starts = rows.to(dtype).unsqueeze(-1).expand_as(leads)[leads][order]
+        parts.append((*found.unique_consecutive(return_counts=True), starts))
+    empty = torch.empty(0, dtype=torch.int64, device=device)
+    masks, place = torch.cat([empty, *(part[0] for part in parts)]).unique(
+        return_inverse=True
+    )
+    if not len(masks):  # the index needs at least one component; 0 is none
+        one = torch.ones(1, dtype=torch.int64, device=device)
+        return ComponentIndex(one - 1, (one - 1).to(dtype), one - 1, one)
+    counts = torch.cat([part[1] for part in parts])
+    size = torch.zeros_like(masks).index_add_(0, place, counts)
+    offset = size.cumsum(0) - size
+    starts = torch.empty(int(size.sum()), dtype=dtype, device=device)
+    following = offset.clone()
+    parts.reverse()
+    for own in place.split([len(part[0]) for part in parts[::-1]]):
+        _, count, rows = parts.pop()  # to need little more memory than the index
+        shift = following[own] - (count.cumsum(0) - count)
+        here = shift.repeat_interleave(count) + torch.arange(len(rows), device=device)
+        starts[here] = rows
+        following[own] += count
+    return ComponentIndex(masks, starts, offset, size)
 
 
 class ComponentDonors(BufferDonors):
