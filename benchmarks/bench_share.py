@@ -1,7 +1,7 @@
 """The share of a training step that sampling, swapping and goals take.
 
-Run with ``pytest benchmarks/bench_share.py --benchmark-only --ratios=<file>`` (part of
-``make bench``). A step of TD3 is that of ``bench_td3`` (half of two critic updates, one
+Run with ``pytest benchmarks/bench_share.py --benchmark-only --ratios=<folder>``, in
+``make bench`` too. A TD3 step is that of ``bench_td3`` (half of two critic updates, one
 of the policy and one of the targets) on transitions of Fetch-Push from 1 M rows; the
 example samples four batches at once, which is measured too. A step of LMP is that of
 ``bench_lmp``, on windows of the kitchen from 6,000 rows. The share is the time of

@@ -34,6 +34,8 @@ PACKAGE = Path(torchrl_caiac.__file__).parent
 FOREIGN = {"torch", "torchrl", "tensordict"}
 # Methods that TorchRL's documentation tells subclasses to write, and dunder-like names.
 HOOKS = {"_AcceptedKeys", "_call", "_inv_call", "_step", "_reset", "_set_seed"}
+# Methods of named tuples, which Python documents.
+NAMED_TUPLE = {"_asdict", "_replace"}
 
 
 def private(name):
@@ -42,7 +44,7 @@ def private(name):
 
 def own_names(trees):
     """Every private name that the package defines itself."""
-    names = set(HOOKS)
+    names = HOOKS | NAMED_TUPLE
     for tree in trees:
         for node in ast.walk(tree):
             if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
@@ -81,13 +83,7 @@ def touched(tree, own):
 
 # Of gymnasium-robotics, OGBench and Python.
 ALLOWED = {
-    "before._replace",
-    "checked._replace",
-    "draw._replace",
-    "options._asdict",
     "os._exit",
-    "self._build(source, storage, data, built)._replace",
-    "split._replace",
     # What OGBench's controller and buttons depend on has no public name.
     "self._task._cur_button_states",
     "self._task._pinch_site_id",
