@@ -14,6 +14,7 @@ PAGES = {
     "loud": "<p>text<script>console.error('a script failed')</script>",
     "remote": "<p>text<img src='http://localhost:9/picture.png'>",
     "broken": "<p>text<img src='missing.png'>",
+    "uncopied": "<p>text<div class=highlight><pre>code</pre></div>",
     "pale": "<style>[data-theme=dark] p { color: #777 }</style><p>text",
 }
 
@@ -39,6 +40,7 @@ def test_bad_pages_are_found(tmp_path: Path, monkeypatch) -> None:
     assert "a script failed" in wrong
     assert "remote.html loads http://localhost:9/picture.png" in wrong
     assert "broken.html: no http" in wrong
+    assert "uncopied.html: code has no button" in wrong
     assert "pale.html, dark: contrast" in wrong
     assert "pale.html, light" not in wrong
     assert "good.html" not in wrong
