@@ -1,8 +1,9 @@
 """Linear layers, to ``F.linear``: what computes them, by shape, strides and gradients.
 
-Run with ``pytest benchmarks/bench_linear.py`` (``make bench``). *Chosen* is
-:func:`torchrl_caiac.modules.linear.linear`, which must not be slower than ``F.linear``
-anywhere. The other candidates are listed, with times as ratios to ``F.linear``:
+Run with ``pytest benchmarks/bench_linear.py`` (``make bench``). ``linear`` of
+:mod:`torchrl_caiac.modules.linear` and, for scoring, ``inference_linear`` must not be
+slower than ``F.linear`` anywhere. Their candidates are listed, with times as ratios to
+``F.linear``:
 
 - ``onednn``: ``F.linear`` with ``torch.backends.mkldnn.matmul.fp32_precision="bf16"``,
   on processors where that still computes in float32;
@@ -27,7 +28,7 @@ import torch.nn.functional as F
 from benchmarks.ratios import seconds
 from torchrl_caiac._kernels import onednn_has_float32
 from torchrl_caiac.modules import linear_kernel
-from torchrl_caiac.modules.linear import linear
+from torchrl_caiac.modules.linear import inference_linear, linear
 
 CASES = {  # rows, inputs and outputs; how the input is cut from a larger matrix
     "4 x 256 x 256": (4, 256, 256, "all"),
@@ -77,20 +78,25 @@ def fixed(kernel: Any) -> Product:
     return product
 
 
-def candidates(weight: torch.Tensor, *, training: bool) -> dict[str, Product]:
+def candidates(
+    value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, *, training: bool
+) -> dict[str, Product]:
     found: dict[str, Product] = {
         "F.linear": torchs,
-        "chosen": lambda *x: linear(*x, relu=True),
+        "linear": lambda *x: linear(*x, relu=True),
         "bfloat16": in_bfloat16,
     }
     if onednn_has_float32():
         found["onednn"] = fixed("onednn")
+    if not training:
+        apply = inference_linear(weight, bias, True, len(value))
+        found["inference_linear"] = lambda value, *_: apply(value)
     if not training and torch.backends.mkldnn.is_available():
         operators = torch.ops.mkldnn
         found["private"] = lambda value, weight, bias: operators._linear_pointwise(
             value, weight, bias, "relu", [], ""
         )
-        packed = operators._reorder_linear_weight(weight)
+        packed = operators._reorder_linear_weight(weight.detach())
         found["packed"] = lambda value, _, bias: operators._linear_pointwise(
             value, packed, bias, "relu", [], ""
         )
@@ -120,15 +126,17 @@ def bench_linear(benchmark, judge, note, case, training):
 
     calls = {
         name: repeated(product)
-        for name, product in candidates(weight.detach(), training=training).items()
+        for name, product in candidates(*factors, training=training).items()
     }
     times = seconds(calls, rounds=25, warmup=3, clock=time.thread_time, statistic=min)
     ratios = {name: value / times["F.linear"] for name, value in times.items()}
     what = f"{'training' if training else 'scoring'}, {case}"
-    judge(f"linear, {what}, time / F.linear", ratios.pop("chosen"), at_most=1.1)
+    for name in ("linear", "inference_linear"):
+        if name in ratios:
+            judge(f"{name}, {what} / F.linear", ratios.pop(name), at_most=1.1)
     del ratios["F.linear"]
     note("  " + ", ".join(f"{name} {value:.2f}" for name, value in ratios.items()))
     benchmark.extra_info["us"] = {
         name: round(1e6 * value / repeats, 1) for name, value in times.items()
     }
-    benchmark.pedantic(calls["chosen"], rounds=5)
+    benchmark.pedantic(calls["linear"], rounds=5)

@@ -25,6 +25,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch.profiler import ProfilerActivity, profile
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import ReplayBuffer, SliceSampler, TensorStorage
 
 from benchmarks.ratios import seconds
@@ -282,6 +283,57 @@ def bench_windows(
     judge(label, rate, at_least=20)
     benchmark.pedantic(calls["swap"], rounds=20)
 
+
+class Operations(TorchDispatchMode):
+    """Counts operations of torch, and those that the host reads a result of."""
+
+    READS = ("aten._local_scalar_dense", "aten.equal", "aten.nonzero")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = self.reads = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        self.count += 1
+        self.reads += str(func).startswith(self.READS)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("shape", ["transitions", "windows"])
+def bench_operations(
+    benchmark: Any, judge: Any, shape: str, folder: Path, device: torch.device
+) -> None:
+    """Operations, views included, and results read: the same on every processor."""
+    kind = "memory" if device.type == "cpu" else "cuda"
+    setting = (
+        made(TRANSITIONS, 512, "10k", kind, folder, device)
+        if shape == "transitions"
+        else made(WINDOWS, 500, "10k", kind, folder, device)
+    )
+    calls = setting.calls()
+    found = {}
+    for name in ("plain", *LABELS):
+        if name in calls:
+            for _ in range(FIRST_BATCHES):
+                calls[name]()
+            with Operations() as found[name]:
+                calls[name]()
+    plain = found.pop("plain")
+    for name, other in found.items():
+        label = f"{shape}, {LABELS[name]}: operations more than plain"
+        judge(label, other.count - plain.count, at_most=MOST_OPERATIONS[name])
+        label = f"{shape}, {LABELS[name]}: results read more than plain"
+        judge(
+            label, other.reads - plain.reads, at_most=7 if device.type == "cpu" else 0
+        )
+    benchmark.pedantic(calls["swap"], rounds=20)
+
+
+# Batches in which the share of free entities and stored end flags are looked at.
+FIRST_BATCHES = 21
+MOST_OPERATIONS = {"swap": 105, "lookahead": 120, "goals": 150, "donors": 130}
 
 LABELS = {
     "swap": "swap",

@@ -41,7 +41,7 @@ from benchmarks.bench_td3 import LAYOUT, Learner
 from benchmarks.ratios import seconds
 from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.envs import fetch_push_reward
-from torchrl_caiac.modules.linear import faster_dtype
+from torchrl_caiac.modules import faster_dtype
 from torchrl_caiac.transforms import CAIACTransform, HindsightGoal
 
 EPISODES, LENGTH, BATCH = 200, 100, 512

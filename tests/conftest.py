@@ -125,7 +125,7 @@ def new_process(
 
     def start(fastest: str) -> None:
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache" / fastest))
-        monkeypatch.setattr(_kernels, "_state", _kernels._State())
+        monkeypatch.setattr(_kernels, "_base", _kernels._State())
         monkeypatch.setattr(_kernels, "_files", {})
         monkeypatch.setattr(_kernels, "_fastest", lambda default, candidates: fastest)
 

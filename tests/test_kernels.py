@@ -32,7 +32,7 @@ from torchrl_caiac.modules import linear_kernel
 def cache(tmp_path, monkeypatch) -> Path:
     """The folder of a user who has measured nothing."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(_kernels, "_state", _kernels._State())
+    monkeypatch.setattr(_kernels, "_base", _kernels._State())
     monkeypatch.setattr(_kernels, "_files", {})
     return tmp_path / "torchrl_caiac"
 
@@ -65,7 +65,7 @@ def refuse() -> dict:
 
 def forget(monkeypatch) -> None:
     """Stands in for a new process."""
-    monkeypatch.setattr(_kernels, "_state", _kernels._State())
+    monkeypatch.setattr(_kernels, "_base", _kernels._State())
     monkeypatch.setattr(_kernels, "_files", {})
 
 
@@ -184,6 +184,37 @@ def test_a_read_only_home_is_measured_in_each_process(timed, cache, read_only):
     assert choose("8x8x8", "plain", timed(plain=1.0, onednn=0.5)) == "onednn"
     assert choose("8x8x8", "plain", refuse) == "onednn"
     assert not list(cache.iterdir())
+
+
+def test_without_a_home_it_is_measured_in_each_process(timed, monkeypatch, tmp_path):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(_kernels.os.path, "expanduser", lambda path: path)
+    monkeypatch.chdir(tmp_path)
+    assert choose("8x8x8", "plain", timed(plain=1.0, onednn=0.5)) == "onednn"
+    assert choose("8x8x8", "plain", refuse) == "onednn"
+    assert not list(tmp_path.iterdir())
+
+
+def test_threads_have_their_own_context(monkeypatch):
+    monkeypatch.setattr(_kernels, "onednn_has_float32", lambda: True)
+    inside, left = threading.Event(), threading.Event()
+    found = []
+
+    def other() -> None:
+        with linear_kernel("onednn"):
+            inside.set()
+            left.wait()
+            found.append(known_kernel(1, lambda: "8x8x8", refuse))
+
+    thread = threading.Thread(target=other)
+    with linear_kernel("plain"):
+        thread.start()
+        inside.wait()
+        assert known_kernel(1, lambda: "8x8x8", refuse) == "plain"
+    left.set()
+    thread.join()
+    assert found == ["onednn"]
+    assert _kernels.kernel_mode() == "auto"
 
 
 @pytest.mark.parametrize("kernel", ["plain", "onednn", "auto"])

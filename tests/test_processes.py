@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -241,7 +242,8 @@ class TestRunInProcesses:
         assert list(run_in_processes(print, [])) == []
 
     @pytest.mark.slow
-    def test_processes_end_with_a_killed_parent(self, jobs, tmp_path):
+    @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+    def test_processes_end_with_a_killed_parent(self, number, jobs, tmp_path):
         claims = tmp_path / "claims"
         claims.mkdir()
         parent = subprocess.Popen(
@@ -253,8 +255,8 @@ class TestRunInProcesses:
                 assert parent.poll() is None and time.monotonic() < end
                 time.sleep(0.05)
         finally:
-            parent.kill()
-            parent.wait()
+            parent.send_signal(number)  # a job would take 600 s
+            assert parent.wait(300)
         # Of the process that asks, and of the one that it has started in turn.
         folders = [path for path in claims.iterdir() if path.is_dir()]
         assert len(folders) == 2

@@ -24,7 +24,7 @@ from torchrl_caiac.trajectory_cache import TrajectoryCache
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.lookahead import Lookahead
 
-SIZE = 24
+SIZE = 40
 LAYOUT = EntityLayout({"arm": [0], "cup": [1], "lid": [2]}, fixed=["arm"])
 
 
@@ -48,9 +48,9 @@ class Source:
         ids, done = [], []
         for _ in range(count):
             ends = bool(torch.rand((), generator=self.generator) < 0.2)
-            swaps = interleaved and bool(torch.rand((), generator=self.generator) < 0.3)
+            swaps = interleaved and bool(torch.rand((), generator=self.generator) < 0.2)
             ids.append((self.number - swaps) % (3 if self.reused else 10**6))
-            done.append(ends and bool(torch.rand((), generator=self.generator) < 0.7))
+            done.append(ends and bool(torch.rand((), generator=self.generator) < 0.5))
             self.number += ends
         state = torch.rand(count + 1, 3, generator=self.generator)
         next_rows = {"observation": state[1:], "done": torch.tensor(done)[:, None]}
@@ -85,34 +85,34 @@ def lookahead(rule: int | str, keys: TransformKeys) -> Lookahead:
 
 
 writes = st.tuples(
-    st.sampled_from(["extend"] * 6 + ["add", "set_at_", "write_at", "raw", "empty"]),
-    st.integers(1, SIZE + 2),
-    st.booleans(),
+    st.sampled_from(["extend"] * 8 + ["add", "set_at_", "write_at", "raw", "empty"]),
+    st.one_of(st.integers(1, 6), st.integers(1, 6), st.integers(1, SIZE + 2)),
+    st.sampled_from([False, False, False, True]),
+    st.sampled_from([False, True, True, True]),
 )
 
 
 @pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
 @pytest.mark.parametrize("ids", ["episode", None])
 @given(
-    st.lists(writes, min_size=1, max_size=12),
+    st.lists(writes, min_size=1, max_size=16),
     st.sampled_from(["next", "goal", 0, 2]),
     st.integers(0, 2**20),
     st.booleans(),
-    st.booleans(),
     st.sampled_from([TensorDictReplayBuffer, ReplayBuffer]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_what_is_kept_is_what_would_be_built(
-    storage, ids, calls, rule, seed, interleaved, reused, kind
+    storage, ids, calls, rule, seed, reused, kind
 ) -> None:
     source = Source(seed, reused)
     rb = kind(storage=storage(SIZE), batch_size=2)
     rb.append_transform(ScoreOnWrite(Height()))
-    rb.extend(source.rows(7, False))
+    rb.extend(source.rows(20, False))
     keys = TransformKeys(trajectory=ids)
     own = lookahead(rule, keys)
     cache = TrajectoryCache(trajectory_key=ids, done_key=("next", "done"))
-    for name, count, looks in calls:
+    for name, count, interleaved, looks in calls:
         few = min(count, len(rb))
         if name == "extend":
             rb.extend(source.rows(count, interleaved))
@@ -173,6 +173,25 @@ def test_trajectories_that_were_not_written_to_are_not_read_again() -> None:
         assert torch.equal(own.table(rb)[30:70], table[30:70])
     rb.storage[torch.tensor([60])] = rb.storage[:][60:61].clone()
     assert cache.get(rb.storage).remaining(torch.tensor(45)) == 0
+
+
+@pytest.mark.parametrize("later", [rows(20, 10), rows(200, 5)])
+def test_rows_that_continue_an_earlier_trajectory_are_joined_with_it(later) -> None:
+    rb, keys = ring(), TransformKeys()
+    cache = TrajectoryCache(trajectory_key="episode", done_key=None)
+    own = lookahead("next", keys)
+    cache.get(rb.storage), own.table(rb)
+    rb.extend(later)
+    assert_same(cache.get(rb.storage), trajectory_index(rb, done_key=None))
+    assert torch.equal(own.table(rb), lookahead("next", keys).table(rb))
+
+
+def test_rows_at_other_places_are_not_taken_for_later_ones() -> None:
+    rb = ring()
+    cache = TrajectoryCache(trajectory_key="episode", done_key=None)
+    cache.get(rb.storage)
+    rb.writer.write_at(torch.arange(80, 90), rows(70, 10))  # as the last ones
+    assert_same(cache.get(rb.storage), trajectory_index(rb, done_key=None))
 
 
 def test_an_index_in_use_is_not_changed_by_a_write() -> None:

@@ -13,11 +13,13 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from filelock import FileLock
 
@@ -64,9 +66,21 @@ class _State:
     known: dict[Any, str] = field(default_factory=dict)
 
 
-_state = _State()
-_files: dict[Path, dict[str, str]] = {}
+_base = _State()
+# Of the threads and tasks in one of the context managers below.
+_scoped: ContextVar[_State | None] = ContextVar("linear_kernels", default=None)
+_files: dict[Path | None, dict[str, str]] = {}
 _watching: weakref.WeakSet[UsedKernels] = weakref.WeakSet()
+
+
+def _state() -> _State:
+    return _scoped.get() or _base
+
+
+def _forget() -> None:
+    """Has every kind of product looked up again."""
+    _base.known.clear()
+    _state().known.clear()
 
 
 class UsedKernels:
@@ -75,7 +89,7 @@ class UsedKernels:
     def __init__(self) -> None:
         self._chosen: dict[str, str] = {}
         _watching.add(self)
-        _state.known.clear()
+        _forget()
 
     def add(self, name: str, kernel: str) -> None:
         """Adds a choice."""
@@ -83,7 +97,7 @@ class UsedKernels:
 
     def state(self) -> dict[str, Any]:
         """Returns what :func:`keep_kernels` and :func:`only_kernels` take, for JSON."""
-        return {"kernel": _state.mode, "chosen": dict(sorted(self._chosen.items()))}
+        return {"kernel": _state().mode, "chosen": dict(sorted(self._chosen.items()))}
 
 
 @contextmanager
@@ -130,13 +144,13 @@ def linear_kernel(kernel: Literal["auto", "plain", "onednn"]) -> Iterator[None]:
             "linear_kernel is 'onednn', but on this processor oneDNN would round "
             'float32 factors to bfloat16: use "auto" or "plain"'
         )
-    with _using(_State(kernel, _state.kept)):
+    with _using(_State(kernel, _state().kept)):
         yield
 
 
 def kernel_mode() -> str:
     """Returns what :func:`linear_kernel` has set."""
-    return _state.mode
+    return _state().mode
 
 
 @contextmanager
@@ -155,12 +169,11 @@ def only_kernels(state: Mapping[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def _using(state: _State) -> Iterator[None]:
-    global _state
-    before, _state = _state, state
+    token = _scoped.set(state)
     try:
         yield
     finally:
-        _state = before
+        _scoped.reset(token)
 
 
 def check_kernels(state: Any) -> None:
@@ -184,8 +197,8 @@ def keep_kernels(state: Mapping[str, Any]) -> None:
     Args:
         state (Mapping): as from :meth:`UsedKernels.state`.
     """
-    _state.kept.update(_usable(state)["chosen"])
-    _state.known.clear()
+    _state().kept.update(_usable(state)["chosen"])
+    _forget()
 
 
 def _usable(state: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -215,12 +228,13 @@ def known_kernel(
         name (callable): returns a name of the kind for files.
         others (callable): as :func:`choose` takes it.
     """
-    kernel = _state.known.get(key)
+    state = _state()
+    kernel = state.known.get(key)
     if kernel is None:
-        kernel = _state.mode
+        kernel = state.mode
         if kernel == "auto":
             kernel = choose(name(), "plain", others)
-        _state.known[key] = kernel
+        state.known[key] = kernel
     return kernel
 
 
@@ -239,8 +253,9 @@ def choose(
     Returns:
         str: the name of one.
     """
-    kernel = _state.kept.get(name)
-    if kernel is None and _state.only:
+    state = _state()
+    kernel = state.kept.get(name)
+    if kernel is None and state.only:
         return default
     if kernel is None:
         file = _cache_file()
@@ -305,20 +320,22 @@ def processor_slug(name: str) -> str:
     return re.sub("[^a-z0-9]+", "_", name.lower()).strip("_") or "unknown"
 
 
-def _cache_file() -> Path:
-    """Returns the file of this processor's choices."""
+def _cache_file() -> Path | None:
+    """Returns the file of this processor's choices, ``None`` without a home."""
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if not os.path.isabs(folder):
+        return None
     own = machine()
     digest = hashlib.sha256(json.dumps(own).encode()).hexdigest()[:12]
     slug = processor_slug(own["processor"])
     return Path(folder, "torchrl_caiac", f"linear-{slug}-{digest}.json")
 
 
-def _stored(file: Path) -> dict[str, str]:
+def _stored(file: Path | None) -> dict[str, str]:
     """Returns the choices in a file, which is read once."""
     if file not in _files:
         try:
-            _files[file] = _read(file)
+            _files[file] = {} if file is None else _read(file)
         except (OSError, UnreadableFileError) as error:
             _logger.warning("%s: it is ignored, and written anew", error)
             _files[file] = {}
@@ -339,8 +356,10 @@ def _read(file: Path) -> dict[str, str]:
     return choices
 
 
-def _store(file: Path, name: str, kernel: str) -> str:
+def _store(file: Path | None, name: str, kernel: str) -> str:
     """Adds a choice to a file, unless another process has; returns what it contains."""
+    if file is None:
+        return _stored(file).setdefault(name, kernel)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(file.with_suffix(".lock"), timeout=1.0):
@@ -351,7 +370,7 @@ def _store(file: Path, name: str, kernel: str) -> str:
             kernel = choices.setdefault(name, kernel)
             write_json(file, _content(choices))
             _files[file] = choices
-    except OSError as error:  # a home that is read-only: measured in each process
+    except (OSError, NotImplementedError) as error:  # a home without writing or locks
         _logger.info("cannot keep measured kernels in %s: %s", file, error)
         _stored(file)[name] = kernel
     return kernel
@@ -373,10 +392,10 @@ def onednn_has_float32() -> bool:
     """Returns whether oneDNN multiplies in float32 on this processor."""
     if not torch.backends.mkldnn.is_available():
         return False
-    generator = torch.Generator().manual_seed(0)
-    draw = torch.empty(2, 256, 256, dtype=torch.float32, device="cpu")
-    one, other = draw.uniform_(generator=generator)
-    with torch.no_grad(), through_onednn():
+    # Not torch's generators, which a torch.vmap around this may refuse.
+    draw = np.random.default_rng(0).random((2, 256, 256), dtype=np.float32)
+    one, other = (torch.from_numpy(x) for x in draw)
+    with through_onednn():
         product = one @ other
     exact = one.double() @ other.double()
     # The error of float32 is at most 2**-16 of it, that of bfloat16 2**-9 of a term.

@@ -11,6 +11,8 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import islice
+from multiprocessing.connection import Connection
+from multiprocessing.connection import wait as wait_for_any
 from multiprocessing.reduction import ForkingPickler
 from multiprocessing.util import Finalize
 from typing import Any
@@ -122,6 +124,7 @@ def run_in_processes(
             error that cannot be pickled, described with its traceback.
         TypeError: the arguments of a job cannot be pickled.
         Exception: whatever a job or ``setup`` raised.
+        KeyboardInterrupt: the processes are ended at once, in the middle of their jobs.
 
     Examples:
         >>> from math import hypot
@@ -136,11 +139,12 @@ def run_in_processes(
         return
     # spawn: forked copies of torch's and OpenGL's threads may hang.
     context = multiprocessing.get_context("spawn")
+    stopped, stop = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(
         processes,
         mp_context=context,
         initializer=_start_worker,
-        initargs=(context.Value("i", 0), setup),
+        initargs=(context.Value("i", 0), stopped, setup),
     )
     waiting = enumerate(jobs)
     running: dict[Any, int] = {}
@@ -162,6 +166,9 @@ def run_in_processes(
             ]
             start(len(finished))
             yield from sorted(finished)
+    except KeyboardInterrupt:
+        stop.close()  # jobs may take hours
+        raise
     except BrokenProcessPool as error:
         raise RuntimeError(
             "a process ended in the middle of a job, perhaps killed for lack of "
@@ -169,6 +176,8 @@ def run_in_processes(
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
+        stop.close()
+        stopped.close()
 
 
 def _run_here(
@@ -262,9 +271,11 @@ def _can_be_pickled(error: Exception) -> bool:
     return True
 
 
-def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:
+def _start_worker(
+    counter: Any, stopped: Connection, setup: Callable[[], Any] | None
+) -> None:
     global _worker, _setup_error
-    _end_with_parent()
+    _end_with_parent(stopped)
     with counter.get_lock():
         os.environ[_POSITION] = str(counter.value)
         counter.value += 1
@@ -281,8 +292,8 @@ def _start_worker(counter: Any, setup: Callable[[], Any] | None) -> None:
     _worker = (made,)
 
 
-def _end_with_parent() -> None:
-    """Makes this process exit as soon as its parent process has ended.
+def _end_with_parent(stopped: Connection) -> None:
+    """Makes this process exit as soon as its parent process has ended or is stopped.
 
     Otherwise a process whose parent was killed would wait for jobs forever, or write to
     the same files as the next run.
@@ -292,7 +303,7 @@ def _end_with_parent() -> None:
         return
 
     def watch() -> None:
-        parent.join()
+        wait_for_any([parent.sentinel, stopped])
         os._exit(1)  # at once: the main thread may be in the middle of a long job
 
     threading.Thread(target=watch, daemon=True).start()

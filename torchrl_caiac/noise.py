@@ -11,6 +11,7 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_caiac._checks import check_int, check_local
 from torchrl_caiac._layout_units import position_features
+from torchrl_caiac._spread import spread_rows
 from torchrl_caiac._torchrl import storage_rows
 from torchrl_caiac.entities import EntityLayout
 
@@ -219,11 +220,7 @@ def sample_rows(data: TensorDictBase | ReplayBuffer, max_rows: int) -> TensorDic
             f"the data have batch size {list(data.batch_size)}, expected at least one "
             "row: collect or load transitions first"
         )
-    if len(data) <= max_rows:
-        return data
-    # float32 does not hold the numbers of rows from 16.7 million on
-    rows = torch.linspace(0, len(data) - 1, max_rows, dtype=torch.float64)
-    return data[rows.round().long()]
+    return data if len(data) <= max_rows else data[spread_rows(len(data), max_rows)]
 
 
 def _entity(

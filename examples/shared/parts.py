@@ -17,7 +17,7 @@ from environments.base import Environment
 from learners.base import Learner
 from methods.base import Method
 from torchrl_caiac._files import read_json, write_json
-from torchrl_caiac.modules.linear import faster_dtype
+from torchrl_caiac.modules import faster_dtype
 
 __all__ = [
     "candidates",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -11,6 +12,41 @@ import pytest
 
 from tests.cli.conftest import Caiac
 from tests.cli.test_score import SCORE, contents
+from tests.pushes import LAYOUT, push_transitions
+from torchrl_caiac.data import write_transitions
+
+# The command line, whose first process kills itself when there are scores.
+FATAL = """
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from torchrl_caiac.cli import main
+from torchrl_caiac.influence import MotionInfluence
+
+original, note = MotionInfluence.forward, Path(os.environ["NOTE"])
+
+
+def fatal(self, td):
+    if any(Path("two").rglob("*.npz")):
+        if os.environ.get("RANK", "0") != "0":
+            time.sleep(600)  # until it is ended
+        try:
+            note.touch(exist_ok=False)
+        except FileExistsError:
+            pass
+        else:
+            os.kill(os.getpid(), signal.SIGKILL)
+    return original(self, td)
+
+
+MotionInfluence.forward = fatal
+if __name__ == "__main__":
+    sys.exit(main())
+"""
+MODULE = ("-m", "torchrl_caiac")
 
 
 def test_workers_write_what_one_process_writes(caiac: Caiac, scored: Path) -> None:
@@ -20,14 +56,11 @@ def test_workers_write_what_one_process_writes(caiac: Caiac, scored: Path) -> No
     assert caiac(*SCORE[:-1], "two").code == 0  # and nothing is left to do
 
 
-def torchrun(*arguments: str, ranks: int) -> subprocess.CompletedProcess[str]:
-    root = Path(__file__).parents[2]
+def python(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    paths = {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
     return subprocess.run(
-        [
-            *(sys.executable, "-m", "torch.distributed.run", "--standalone"),
-            *(f"--nproc-per-node={ranks}", "-m", "torchrl_caiac", *arguments),
-        ],
-        env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
+        [sys.executable, *arguments],
+        env={**os.environ, **paths, **variables},
         capture_output=True,
         text=True,
         timeout=300,
@@ -35,8 +68,13 @@ def torchrun(*arguments: str, ranks: int) -> subprocess.CompletedProcess[str]:
     )
 
 
+def torchrun(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    options = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
+    return python(*options, *arguments, **variables)
+
+
 def test_torchrun_writes_what_one_process_writes(caiac: Caiac, scored: Path) -> None:
-    result = torchrun(*SCORE[:-1], "two", ranks=2)
+    result = torchrun(*MODULE, *SCORE[:-1], "two")
     assert result.returncode == 0, result.stderr
     assert contents(Path("two")) == contents(scored)
     assert result.stdout.count("written to two") == 1
@@ -44,10 +82,39 @@ def test_torchrun_writes_what_one_process_writes(caiac: Caiac, scored: Path) -> 
 
 def test_a_failure_of_rank_0_ends_all_ranks(caiac: Caiac, scored: Path) -> None:
     before = contents(scored)
-    result = torchrun(*SCORE, "--lookahead", "5", ranks=2)
+    result = torchrun(*MODULE, *SCORE, "--lookahead", "5")
     assert result.returncode != 0
     assert "lookahead was 1, is 5" in result.stderr
     assert contents(scored) == before
+
+
+@pytest.mark.slow
+def test_a_repeated_call_goes_on_after_processes_were_killed(caiac: Caiac) -> None:
+    rows = push_transitions((40, 30, 50) * 120)  # several ranges of 4096
+    write_transitions(rows, "pushes", action_bounds=([-1], [1]))
+    LAYOUT.save("layout.json")
+    Path("fatal.py").write_text(FATAL)
+    assert caiac(*SCORE[:-1], "one").code == 0
+    command = ("fatal.py", *SCORE[:-1], "two")
+    record = Path("two/data/caiac.score.json")
+
+    result = torchrun(*command, NOTE="rank")
+    assert result.returncode and Path("rank").exists(), result.stderr
+    assert json.loads(record.read_text())["state"] == "scoring"
+    kept = set(Path("two").rglob("*.npz"))
+    assert kept
+
+    result = python(*command, "--workers", "2", NOTE="worker")
+    assert Path("worker").exists()
+    assert result.returncode == 1 and not result.stdout
+    assert "two/data was killed" in result.stderr
+    assert "repeat the same call" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert json.loads(record.read_text())["state"] == "scoring"
+    assert kept <= set(Path("two").rglob("*.npz"))
+
+    assert caiac(*SCORE[:-1], "two").code == 0
+    assert contents(Path("two")) == contents(Path("one"))
 
 
 @pytest.mark.parametrize("workers", ["0", "-1"])

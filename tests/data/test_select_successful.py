@@ -138,6 +138,16 @@ def test_memory_mapped_data_are_read_and_written(tmp_path) -> None:
         select_successful(data, path=tmp_path / "part")
 
 
+def test_many_rows_are_written_in_parts(tmp_path) -> None:
+    number = torch.arange(200_000)
+    success = number % 100 == 90
+    data = make_rows((number // 100).tolist(), success.tolist())
+    whole = select_successful(data)
+    found = select_successful(data, path=tmp_path / "part")
+    assert len(whole) == 182_000
+    assert all(torch.equal(leaf, found[key]) for key, leaf in whole.items(True, True))
+
+
 def test_numbers_are_compared() -> None:
     data = make_rows(EPISODE, SUCCESS)
     data["next", "reward"] = torch.tensor(SUCCESS).float() - 1.0

@@ -247,3 +247,13 @@ def test_both_dtypes_are_measured(monkeypatch, tmp_path):
         assert faster_dtype(256, 96) in (torch.float32, torch.bfloat16)
     shapes = ((256, 96), (96, 96), True)
     assert seen == {(torch.float32, *shapes), (torch.bfloat16, *shapes)}
+
+
+@pytest.mark.parametrize("needs", [False, True])
+def test_operands_from_around_a_map(monkeypatch, tmp_path, needs):
+    """What measures may not run inside of torch.vmap."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    operands = [draw(256, 80), draw(128, 80, seed=1), draw(128, seed=2)]
+    operands[0].requires_grad_(needs)
+    got = torch.vmap(lambda x: x + linear(*operands).sum())(torch.zeros(2))
+    torch.testing.assert_close(got, F.linear(*operands).sum().expand(2))

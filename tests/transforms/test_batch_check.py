@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from tensordict.utils import NestedKey
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
@@ -389,6 +390,7 @@ FAULTS = "do not follow each other|crosses a trajectory's end"
     place=st.integers(0, 100),
     noise=st.sampled_from([0.0, 0.2]),
     ids=st.sampled_from(["episode", "wide", "collector", "flags alone"]),
+    column_major=st.sets(st.sampled_from(["observation", ("next", "observation")])),
 )
 @pytest.mark.parametrize("nested", [False, True])
 def test_windows_are_successive_rows(
@@ -398,6 +400,7 @@ def test_windows_are_successive_rows(
     place: int,
     noise: float,
     ids: str,
+    column_major: set[NestedKey],
     nested: bool,
 ) -> None:
     td = flat_rows([13, 13], noise)
@@ -426,6 +429,8 @@ def test_windows_are_successive_rows(
     elif fault == "other trajectory":
         wrong[step:] = [row + 13 for row in wrong[step:]]
     batch = td[torch.tensor(windows).flatten()]
+    for key in () if nested else column_major:
+        batch[key] = batch[key].t().contiguous().t()
     layout = EntityLayout.from_keys({"arm": "arm", "cup": "cup"}) if nested else WALK
     transform = CAIACTransform(layout, window=window)
     if fault == "none":

@@ -373,6 +373,34 @@ def test_donors_with_the_score_of_another_state_never_donate(
         assert set(names[::2].tolist()) == starts
 
 
+@pytest.mark.parametrize("has_goals", [False, True])
+@pytest.mark.parametrize("rows", ["random", "last"])
+@pytest.mark.parametrize("layout", [FLAT, NESTED])
+@pytest.mark.parametrize("form", FORMS)
+def test_verified_donors_give_what_others_give(
+    form: str, layout: EntityLayout, rows: str, has_goals: bool
+) -> None:
+    """Rows that were compared are not read again; without checks all are read."""
+    donors = donors_of(form, layout)
+    score(donors, layout, ("caiac", "score"))
+    batch = small(layout, batch=24).sample()
+    outs = [
+        CAIACTransform(
+            layout,
+            rows=rows,
+            swap_prob=0.7,
+            donors=donors,
+            goals=WindowGoal(layout, 1) if has_goals else None,
+            generator=torch.Generator().manual_seed(0),
+            check=check,
+        )(batch)
+        for check in (False, True)
+    ]
+    assert outs[0]["caiac", "swapped"].any()
+    assert set(outs[0].keys(True, True)) == set(outs[1].keys(True, True))
+    assert (outs[0] == outs[1]).all()
+
+
 def test_donors_written_later_donate_once_they_are_scored() -> None:
     donors = donors_of("in order", capacity=30)
     score(donors, FLAT, ("caiac", "score"))

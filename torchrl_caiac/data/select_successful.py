@@ -14,10 +14,12 @@ from torchrl_caiac._checks import check_int
 from torchrl_caiac._keys import get_leaf
 from torchrl_caiac._keys import path as key_path
 from torchrl_caiac.data.action_bounds import action_bounds
-from torchrl_caiac.data.write_transitions import check_free, write_transitions
-from torchrl_caiac.trajectories import end_flags, trajectory_index
+from torchrl_caiac.data.write_transitions import check_free, write_parts
+from torchrl_caiac.trajectories import TrajectoryIndex, end_flags, trajectory_index
 
 __all__ = ["select_successful"]
+
+_CHUNK = 1 << 16  # rows that are written together
 
 
 def select_successful(
@@ -124,19 +126,56 @@ def select_successful(
     starts, last = ends + 1 - lengths, ends
     if cut:
         last = ends.scatter_reduce(0, number, at, "amin")
-    # The positions of the rows that are kept, trajectory by trajectory.
-    sizes = (last + 1 - starts)[is_successful]
-    number = is_successful.nonzero()[:, 0].repeat_interleave(sizes)
-    shift = starts[is_successful] - (sizes.cumsum(0) - sizes)
-    position = torch.arange(len(number)) + shift.repeat_interleave(sizes)
-    rows = index.rows(position.to(index.device))
-    chosen = data[rows.to(data.device or "cpu")].to_tensordict()
-    if cut:
-        _end(chosen, number, done_key)
+    chosen = _Chosen(
+        starts[is_successful], (last + 1 - starts)[is_successful], index, data
+    )
+    step = len(chosen) if path is None else _CHUNK
+    parts = (
+        chosen.part(first, min(first + step, len(chosen)), done_key if cut else None)
+        for first in range(0, len(chosen), step)
+    )
     if path is None:
-        return chosen
-    bounds = action_bounds(data)
-    return write_transitions(chosen, path, overwrite=overwrite, action_bounds=bounds)
+        return next(parts)
+    like = data[:1].to_tensordict().expand(len(chosen))
+    return write_parts(
+        like, parts, path, overwrite=overwrite, action_bounds=action_bounds(data)
+    )
+
+
+class _Chosen:
+    """The rows that are kept, trajectory by trajectory.
+
+    Args:
+        starts (torch.Tensor): int64 ``[E]``, the positions of their first rows.
+        sizes (torch.Tensor): int64 ``[E]``, how many of each are kept.
+        index (TrajectoryIndex): the trajectories.
+        data (TensorDictBase): the transitions.
+    """
+
+    def __init__(
+        self,
+        starts: torch.Tensor,
+        sizes: torch.Tensor,
+        index: TrajectoryIndex,
+        data: TensorDictBase,
+    ) -> None:
+        self.stops = sizes.cumsum(0)
+        self.shift = starts - (self.stops - sizes)
+        self.index, self.data = index, data
+
+    def __len__(self) -> int:
+        return int(self.stops[-1])
+
+    def part(self, first: int, stop: int, done_key: NestedKey | None) -> TensorDict:
+        """Returns some of the rows, with ``done_key`` set in the last ones."""
+        place = torch.arange(first, stop)
+        number = torch.searchsorted(self.stops, place, right=True)
+        position = (place + self.shift[number]).to(self.index.device)
+        rows = self.index.rows(position).to(self.data.device or "cpu")
+        found = self.data[rows].to_tensordict()
+        if done_key is not None:
+            _end(found, place + 1 == self.stops[number], done_key)
+        return found
 
 
 def _successes(
@@ -172,14 +211,12 @@ def _successes(
     return leaf.bool()
 
 
-def _end(rows: TensorDict, number: torch.Tensor, done_key: NestedKey | None) -> None:
-    """Sets the end flags of the last row of each trajectory."""
-    last = torch.ones(len(number), dtype=torch.bool)
-    last[:-1] = number[1:] != number[:-1]
-    done = None if done_key is None else end_flags(rows, done_key)
+def _end(rows: TensorDict, last: torch.Tensor, done_key: NestedKey) -> None:
+    """Sets the end flags of the last row of each trajectory, bool ``[n]``."""
+    done = end_flags(rows, done_key)
     if done is not None:  # what ended its trajectory before is not truncated
-        last &= ~done.cpu()
-    for key in () if done_key is None else (done_key, _beside(done_key, "truncated")):
+        last = last & ~done.cpu()
+    for key in (done_key, _beside(done_key, "truncated")):
         flags = rows.get(key, None)
         if flags is not None:
             where = last.view(-1, *(1,) * (flags.ndim - 1)).to(flags.device)

@@ -24,6 +24,7 @@ __all__ = [
     "check_free",
     "check_key_names",
     "whole_transitions",
+    "write_parts",
     "write_transitions",
 ]
 
@@ -213,15 +214,64 @@ def write_transitions(
         ...     write_transitions(data, f"{folder}/data").is_memmap()
         True
     """
+    return write_parts(
+        data, [data], path, overwrite=overwrite, action_bounds=action_bounds
+    )
+
+
+def write_parts(
+    like: TensorDictBase,
+    parts: Iterable[TensorDictBase],
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    action_bounds: tuple[Any, Any] | None = None,
+) -> TensorDict:
+    """Writes transitions part by part, see :func:`write_transitions`.
+
+    Args:
+        like (TensorDictBase): what the transitions are like, ``[T]``: their keys,
+            shapes and types. Its values are not read, so that it may be one row that is
+            expanded.
+        parts (iterable of TensorDictBase): the transitions, ``[T]`` together.
+        path (path): the folder.
+
+    Keyword Args:
+        overwrite (bool): as for :func:`write_transitions`.
+        action_bounds (tuple of torch.Tensor or sequence, optional): the same.
+
+    Returns:
+        TensorDict: the memory-mapped transitions, ``[T]``.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.write_transitions import write_parts
+        >>> row = TensorDict(
+        ...     {
+        ...         "action": torch.zeros(1, 2),
+        ...         "episode": torch.zeros(1, dtype=torch.int64),
+        ...         "next": {"done": torch.tensor([[False]])},
+        ...     },
+        ...     [1],
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_parts(row.expand(2), [row, row], f"{folder}/data").shape
+        torch.Size([2])
+    """
     check_free(path, overwrite)
-    check_transitions(data)
-    check_entries(data)
+    check_transitions(like)
+    check_entries(like)
     if action_bounds is not None:
-        check_bounds_fit(data, action_bounds)
+        check_bounds_fit(like, action_bounds)
     with whole_transitions(path) as folder:
-        stored = data.memmap_like(folder)
+        stored = like.memmap_like(folder)
         reserve(folder)
-        stored.update_(data)
+        start = 0
+        for part in parts:
+            stored[start : start + len(part)].update_(part)
+            start += len(part)
         write_digests(folder)
         if action_bounds is not None:
             write_action_bounds(folder, *action_bounds)

@@ -18,6 +18,7 @@ from torchrl_caiac._extras import extra
 from torchrl_caiac._fit_rows import trajectory_numbers
 from torchrl_caiac._keys import as_key, floating, get_leaf
 from torchrl_caiac._layout_units import position_places
+from torchrl_caiac._spread import spread_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules._action_bounds import check_actions, known_bounds
 
@@ -248,7 +249,7 @@ def _read(
             "half tells whether the actions of the other can be predicted: give more, "
             "or correct trajectory_key"
         )
-    chosen = np.linspace(0, total - 1, min(total, max_rows)).round().astype(np.int64)
+    chosen = spread_rows(total, max_rows).numpy()
     states, actions, first = [], [], 0
     for td in sources:
         own = chosen[(chosen >= first) & (chosen < first + len(td))] - first

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import Bounded
 
+from torchrl_caiac._spread import spread_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.mixture_divergence import (
     Approximation,
@@ -371,8 +372,7 @@ class CAI(nn.Module):
         """Finds the range of estimates that the fast mode replaces by exact scores."""
         threshold = self.threshold or math.nan
         if len(states) > _SAMPLE:
-            rows = torch.linspace(0, len(states) - 1, _SAMPLE, dtype=torch.float64)
-            states = states[rows.long()]
+            states = states[spread_rows(len(states), _SAMPLE)]
         nowhere = (threshold, threshold)
         first, exact = (self._score(states, near) for near in (nowhere, None))
         same = (first <= threshold) == (exact <= threshold)

@@ -13,6 +13,7 @@ from torch import nn
 from torchrl_caiac._fingerprints import fingerprint, state_hash
 from torchrl_caiac._kernels import UsedKernels, only_kernels
 from torchrl_caiac._keys import as_key, missing_key
+from torchrl_caiac._spread import spread_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
 from torchrl_caiac.trajectories import TrajectoryIndex
@@ -309,8 +310,7 @@ class Scorer:
         prepare = getattr(self._estimator, "prepare", None)
         if prepare is not None and not self.is_prepared:
             length = self._index.length
-            count = min(length, _SAMPLE)
-            rows = torch.linspace(0, length - 1, count, dtype=torch.float64).long()
+            rows = spread_rows(length, _SAMPLE)
             sample = self._states[rows.to(self._states.device or "cpu")]
             sample = to_device_of(self._estimator, sample)
             prepare(sample, length, smoothing=self._past + self._future + 1)

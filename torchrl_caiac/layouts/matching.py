@@ -9,6 +9,7 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import path
+from torchrl_caiac._spread import spread_rows
 from torchrl_caiac.layouts.description import Columns, LayoutDescription
 from torchrl_caiac.layouts.ready import describe_layout, layout_names
 
@@ -65,9 +66,7 @@ def _fits(description: LayoutDescription, data: TensorDictBase) -> bool:
         return False
     rows = value.reshape(-1, value.shape[-1])
     if len(rows) > _MOST_ROWS:
-        # float32 does not hold the numbers of rows from 16.7 million on
-        spread = torch.linspace(0, len(rows) - 1, _MOST_ROWS, dtype=torch.float64)
-        rows = rows[spread.long()]
+        rows = rows[spread_rows(len(rows), _MOST_ROWS)]
     rows = rows.to(torch.float64)
     return all(
         _share(part, rows, place) >= _SHARE for part, place in description.places

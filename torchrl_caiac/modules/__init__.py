@@ -10,6 +10,7 @@ from torchrl_caiac.modules.goal_networks import (
     GoalConditionedActor,
     GoalConditionedCritic,
 )
+from torchrl_caiac.modules.linear import faster_dtype
 from torchrl_caiac.modules.lmp import LMPModel
 from torchrl_caiac.modules.lmp_actor import LMPActor
 from torchrl_caiac.modules.running_norm import RunningNorm
@@ -25,5 +26,6 @@ __all__ = [
     "LMPModel",
     "RunningNorm",
     "TransformerWorldModel",
+    "faster_dtype",
     "linear_kernel",
 ]

@@ -6,17 +6,19 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrl_caiac._kernels import (
     choose,
+    kernel_mode,
     known_kernel,
     onednn_has_float32,
     through_onednn,
 )
-from torchrl_caiac._torchrl import is_transformed, packed_linear
+from torchrl_caiac._torchrl import packed_linear, transforms_are_active
 
 __all__ = ["faster_dtype", "inference_linear", "linear"]
 
@@ -50,7 +52,7 @@ def linear(value: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> T
                 [0.]])
     """
     # The first condition is cheap, since it delays every small product.
-    if value.numel() * weight.shape[0] < _SMALL or not _has_choice(value, weight, bias):
+    if value.numel() * weight.shape[0] < _SMALL or not _has_choice(value):
         out = F.linear(value, weight, bias)
         return out.relu_() if relu else out
     rows = value if value.ndim == 2 else value.reshape(-1, value.shape[-1])
@@ -91,7 +93,7 @@ def inference_linear(
         tensor([3.])
     """
     is_onednn = False
-    if rows * weight.numel() >= _SMALL and _has_choice(weight, weight, bias):
+    if rows * weight.numel() >= _SMALL and _has_choice(weight):
         product = _Product.of(rows, weight, "packed", relu)
         is_onednn = known_kernel(product, product.name, product.others) == "onednn"
     if is_onednn:
@@ -112,7 +114,7 @@ def faster_dtype(rows: int, width: int) -> torch.dtype:
         see :func:`~torchrl_caiac.modules.linear_kernel`.
 
     Examples:
-        >>> from torchrl_caiac.modules.linear import faster_dtype
+        >>> from torchrl_caiac.modules import faster_dtype
         >>> faster_dtype(1, 2) in (torch.float32, torch.bfloat16)
         True
     """
@@ -129,8 +131,9 @@ def faster_dtype(rows: int, width: int) -> torch.dtype:
             "bfloat16": _step(in_bfloat16, operands, (True, True)),
         }
 
-    name = choose(f"{rows}x{width}x{width} hidden layer", "float32", candidates)
-    dtype: torch.dtype = getattr(torch, name)
+    # Another linear_kernel is another candidate.
+    kind = f"{rows}x{width}x{width} hidden layer {kernel_mode()}"
+    dtype: torch.dtype = getattr(torch, choose(kind, "float32", candidates))
     return dtype
 
 
@@ -214,13 +217,10 @@ def _operands(
     rows: int, inputs: int, outputs: int, layout: str
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Returns a random input of a layout, a weight and a bias."""
-    generator = torch.Generator().manual_seed(0)
+    generator = np.random.default_rng(0)
 
     def draw(*shape: int) -> Tensor:
-        # Not with the defaults for new tensors, which a user may have changed.
-        return torch.empty(shape, dtype=torch.float32, device="cpu").normal_(
-            generator=generator
-        )
+        return torch.from_numpy(generator.standard_normal(shape, dtype=np.float32))
 
     if layout == "transposed":
         value = draw(inputs, rows).t()
@@ -256,17 +256,16 @@ def _step(
     return call
 
 
-def _has_choice(value: Tensor, weight: Tensor, bias: Tensor) -> bool:
-    """Returns whether another kernel than torch's may be faster."""
+def _has_choice(value: Tensor) -> bool:
+    """Returns whether another kernel than torch's may be faster for an input."""
     return (
         # First: the compiler chooses its own kernels, and cannot trace the others.
         not torch.compiler.is_compiling()
         and value.dtype is torch.float32
         and value.device.type == "cpu"
-        and onednn_has_float32()
         and not torch.is_autocast_enabled("cpu")
-        and not (is_transformed(value) or is_transformed(weight))
-        and not is_transformed(bias)
+        and not transforms_are_active()
+        and onednn_has_float32()
     )
 
 

@@ -289,7 +289,8 @@ class BatchCheck:
         for here, there in pairs:
             if (here.shape, here.dtype) != (there.shape, there.dtype):
                 return None
-            here, there = _wide(here), _wide(there)
+            if _is_pairs(here) and _is_pairs(there):  # half as many comparisons
+                here, there = here.view(torch.int64), there.view(torch.int64)
             if not torch.equal(
                 here.unflatten(0, (-1, window))[:, 1:],
                 there.unflatten(0, (-1, window))[:, :-1],
@@ -374,12 +375,15 @@ class BatchCheck:
                 )
 
 
-def _wide(leaf: torch.Tensor) -> torch.Tensor:
-    """Returns a leaf ``[B, ...]`` whose values are pairs, which are compared faster."""
-    is_pairs = leaf.dtype is torch.float32 and leaf.ndim > 1 and not leaf.shape[-1] % 2
-    if is_pairs and leaf.is_contiguous() and not leaf.storage_offset() % 2:
-        return leaf.view(torch.int64)
-    return leaf
+def _is_pairs(leaf: torch.Tensor) -> bool:
+    """Returns whether the values of a leaf ``[B, ...]`` are pairs of 32 bits."""
+    return (
+        leaf.dtype is torch.float32
+        and leaf.ndim > 1
+        and not leaf.shape[-1] % 2
+        and leaf.is_contiguous()
+        and not leaf.storage_offset() % 2
+    )
 
 
 @lru_cache(maxsize=16)
