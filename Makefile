@@ -111,6 +111,6 @@ docs: setup ## build the documentation, warnings are errors
 
 clean: ## remove what was built and cached; .venv and outputs stay
 	rm -rf build dist *.egg-info docs/_build docs/auto_tutorials \
-	    docs/reference/generated docs/sg_execution_times.rst \
+	    docs/reference/generated docs/errors.md \
 	    .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache benchmark-*
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

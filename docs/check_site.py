@@ -2,9 +2,9 @@
 
 ``python docs/check_site.py docs/_build/html`` serves the site on this machine and opens
 its pages at the widths of a desk and of a phone, in light and dark. It fails if a page
-scrolls sideways, logs an error, loads something from another machine, or has text that
-is hard to read; or if the search does not find what it should. ``make docs`` runs it
-where a browser is installed.
+scrolls sideways, logs an error, loads something from another machine, has text that is
+hard to read or code without a button to copy it; or if the search does not find what it
+should. ``make docs`` runs it where a browser is installed.
 """
 
 from __future__ import annotations

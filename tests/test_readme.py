@@ -372,6 +372,12 @@ def test_other_keys(flat_data: TensorDictBase) -> None:
     assert rb.sample()["caiac", "counterfactual"].sum() == 4
 
 
+@pytest.mark.parametrize("page", sorted(ROOT.glob("*.md")), ids=lambda p: p.name)
+def test_files_that_pages_refer_to_exist(page: Path) -> None:
+    targets = re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text())
+    assert not [target for target in targets if not (ROOT / target).exists()]
+
+
 def test_readme_is_short_and_names_loaders() -> None:
     text = (ROOT / "README.md").read_text()
     assert len(text.splitlines()) <= 150
