@@ -21,7 +21,6 @@ import time
 from pathlib import Path
 
 import torch
-from scaling_scoring import rows_of
 from tensordict import TensorDict
 from torch import distributed
 from torchrl.data import Bounded
@@ -77,7 +76,16 @@ def measure(out: Path, work: int) -> None:
     """Measures in a process of ``torchrun``; that of rank 0 writes the table."""
     distributed.init_process_group("gloo")
     logging.getLogger("torchrl_caiac").setLevel(logging.ERROR)  # short fits are bad
-    data = rows_of(ROWS)
+    generator = torch.Generator().manual_seed(0)
+    states = torch.randn(ROWS + 1, 34, generator=generator).cumsum(0).mul_(0.01)
+    data = TensorDict(
+        {
+            "observation": states[:-1],
+            "action": torch.rand(ROWS, 4, generator=generator) * 2 - 1,
+            "next": {"observation": states[1:]},
+        },
+        [ROWS],
+    )
     table = []
     for width, batch in itertools.product(WIDTHS, BATCHES):
         line: dict[str, object] = {"hidden": f"3 x {width}", "batch": batch}
