@@ -82,6 +82,7 @@ def measure(out: Path, work: int) -> None:
         {
             "observation": states[:-1],
             "action": torch.rand(ROWS, 4, generator=generator) * 2 - 1,
+            "episode": torch.arange(ROWS) // 50,
             "next": {"observation": states[1:]},
         },
         [ROWS],
