@@ -27,6 +27,7 @@ import torch.nn.functional as F
 
 from benchmarks.ratios import seconds
 from torchrl_caiac._kernels import onednn_has_float32
+from torchrl_caiac._torchrl import packed_linear
 from torchrl_caiac.modules import linear_kernel
 from torchrl_caiac.modules.linear import inference_linear, linear
 
@@ -92,14 +93,8 @@ def candidates(
         apply = inference_linear(weight, bias, True, len(value))
         found["inference_linear"] = lambda value, *_: apply(value)
     if not training and torch.backends.mkldnn.is_available():
-        operators = torch.ops.mkldnn
-        found["private"] = lambda value, weight, bias: operators._linear_pointwise(
-            value, weight, bias, "relu", [], ""
-        )
-        packed = operators._reorder_linear_weight(weight.detach())
-        found["packed"] = lambda value, _, bias: operators._linear_pointwise(
-            value, packed, bias, "relu", [], ""
-        )
+        packed = packed_linear(weight, bias, True)
+        found["packed"] = lambda value, *_: packed(value)
     return found
 
 

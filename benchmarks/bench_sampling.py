@@ -301,18 +301,20 @@ class Operations(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+def small_calls(shape: str, folder: Path, device: torch.device) -> dict[str, Any]:
+    """Returns what samples 512 transitions or 500 windows of 10,000 rows in memory."""
+    kind = "memory" if device.type == "cpu" else "cuda"
+    if shape == "transitions":
+        return made(TRANSITIONS, 512, "10k", kind, folder, device).calls()
+    return made(WINDOWS, 500, "10k", kind, folder, device).calls()
+
+
 @pytest.mark.parametrize("shape", ["transitions", "windows"])
 def bench_operations(
     benchmark: Any, judge: Any, shape: str, folder: Path, device: torch.device
 ) -> None:
     """Operations, views included, and results read: the same on every processor."""
-    kind = "memory" if device.type == "cpu" else "cuda"
-    setting = (
-        made(TRANSITIONS, 512, "10k", kind, folder, device)
-        if shape == "transitions"
-        else made(WINDOWS, 500, "10k", kind, folder, device)
-    )
-    calls = setting.calls()
+    calls = small_calls(shape, folder, device)
     found = {}
     for name in ("plain", *LABELS):
         if name in calls:
@@ -433,13 +435,7 @@ def bench_memory(
     benchmark: Any, judge: Any, shape: str, folder: Path, device: torch.device
 ) -> None:
     """The peak memory of a sample, including the batch."""
-    kind = "memory" if device.type == "cpu" else "cuda"
-    setting = (
-        made(TRANSITIONS, 512, "10k", kind, folder, device)
-        if shape == "transitions"
-        else made(WINDOWS, 500, "10k", kind, folder, device)
-    )
-    calls = setting.calls()
+    calls = small_calls(shape, folder, device)
     for name, label in LABELS.items():
         if name not in calls:
             continue

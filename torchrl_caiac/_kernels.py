@@ -411,6 +411,7 @@ _precision = "none"  # before the first of them
 def through_onednn() -> Iterator[None]:
     """Context manager in which torch multiplies float32 matrices by oneDNN."""
     global _inside, _precision
+    # torch's type hints lack it.
     setting: Any = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
     with _lock:
         if not _inside:

@@ -86,7 +86,7 @@ class CAIACTransform(CounterfactualTransform):
             in one of the L states after the row (or after the last row of the window).
             ``"goal"``: nor are, besides the next one, entities that are influenced
             before the goal that :class:`~torchrl_caiac.transforms.WindowGoal` drew for
-            the row, so that a swap neither adds nor removes what is left to do.
+            the row. A swapped entity then does not move between the row and its goal.
             ``None``: only the row's own score counts, as in Algorithm 1. It reads the
             trajectories of the buffer that samples (one buffer, no
             :class:`~torchrl.data.ReplayBufferEnsemble`), and of the donor buffer, with

@@ -73,8 +73,11 @@ def check_lookahead(lookahead: object) -> LookaheadArgument:
     """
     if lookahead is None:
         return None
-    if isinstance(lookahead, str) and lookahead in ("next", "goal"):
-        return lookahead  # type: ignore[return-value]
+    if isinstance(lookahead, str):
+        if lookahead == "next":
+            return "next"
+        if lookahead == "goal":
+            return "goal"
     if isinstance(lookahead, bool) or not isinstance(lookahead, int):
         raise TypeError(
             "lookahead must be a number of steps, 'next', 'goal' or None, got "
