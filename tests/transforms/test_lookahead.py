@@ -29,7 +29,7 @@ from torchrl_caiac import CAIACTransform, CoDATransform, EntityLayout
 from torchrl_caiac.evaluation import swap_shares
 from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.trajectories import trajectory_index
-from torchrl_caiac.transforms import WindowGoal
+from torchrl_caiac.transforms import TransformKeys, WindowGoal
 from torchrl_caiac.transforms.lookahead import (
     NEVER,
     hold_entities,
@@ -677,13 +677,46 @@ def test_steps_to_the_goal_are_those_of_the_goal_row() -> None:
     assert torch.equal(batch["hindsight", "steps"], (ahead / 3).long())
 
 
-def test_goals_before_which_to_look_are_needed() -> None:
-    rows = make_rows(*make_influenced())
-    rb = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)), batch_size=64)
+def sample_with_goals(rows: TensorDict, goal_keys: TransformKeys | None) -> TensorDict:
+    """Samples with keys of ``WindowGoal``, or without one."""
+    options = {}
+    if goal_keys is not None:
+        goals = options["sample_unit"] = WindowGoal(GOALS, 1, keys=goal_keys)
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(len(rows)), batch_size=64, **options
+    )
     rb.extend(rows)
-    rb.append_transform(CAIACTransform(LAYOUT, lookahead="goal"))
-    with pytest.raises(KeyError, match="append WindowGoal before this transform"):
-        rb.sample()
+    if goal_keys is not None:
+        rb.append_transform(goals)
+    rb.append_transform(CAIACTransform(GOALS, lookahead="goal"))
+    return rb.sample()
+
+
+@pytest.mark.parametrize(
+    ("goal_keys", "message"),
+    [
+        (None, "append WindowGoal before this transform"),
+        (TransformKeys(goal_steps="steps"), "same keys= to WindowGoal"),
+        (TransformKeys(done=None), "same keys= to WindowGoal"),
+    ],
+)
+def test_goals_are_those_that_the_buffer_draws(goal_keys, message) -> None:
+    rows = make_rows(*make_influenced())
+    rows["hindsight", "steps"] = torch.zeros(len(rows), 1, dtype=torch.int64)  # stale
+    with pytest.raises(RuntimeError, match=message):
+        sample_with_goals(rows, goal_keys)
+    assert len(sample_with_goals(rows, TransformKeys())) == 64
+
+
+def test_goals_of_several_steps_are_refused() -> None:
+    rows = make_rows(*make_influenced())
+    rows["steps_to_next_obs"] = torch.ones(len(rows), 1, dtype=torch.int64)
+    with pytest.raises(ValueError, match="'steps_to_next_obs'"):
+        sample_with_goals(rows, TransformKeys())
+
+
+def test_goals_are_not_drawn_for_a_donor_buffer() -> None:
+    rb = ReplayBuffer(storage=LazyTensorStorage(5))
     with pytest.raises(ValueError, match="donors is a buffer, whose rows have none"):
         CAIACTransform(LAYOUT, lookahead="goal", donors=rb)
 

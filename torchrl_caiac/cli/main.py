@@ -29,9 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command line is wrong; 130: interrupted.
 
     Examples:
-        >>> from torchrl_caiac.cli import main
-        >>> main(["--version"])
-        caiac 0.1.0
+        >>> from torchrl_caiac.cli.main import main
+        >>> main(["--version"])  # doctest: +ELLIPSIS
+        caiac ...
         0
     """
     parser = make_parser()

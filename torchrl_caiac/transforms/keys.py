@@ -39,7 +39,8 @@ class TransformKeys:
             cut off, ``[*B]`` or ``[*B, 1]``. Defaults to ``("next", "truncated")``.
         goal_steps (NestedKey): the rows from a transition to the one whose next state
             is its goal, int64 ``[*B, 1]``, which
-            :class:`~torchrl_caiac.transforms.WindowGoal` writes. Defaults to
+            :class:`~torchrl_caiac.transforms.WindowGoal` writes. Swaps and later
+            relabelling change goals, not this leaf. Defaults to
             ``("hindsight", "steps")``.
 
     Raises:

@@ -19,13 +19,19 @@ from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.influence.score_record import read_record
-from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows, trajectory_index
+from torchrl_caiac.trajectories import (
+    STEPS_KEY,
+    TrajectoryIndex,
+    flat_rows,
+    trajectory_index,
+)
 from torchrl_caiac.trajectory_cache import (
     TrajectoryTail,
     record_writes,
     written_tail,
 )
 from torchrl_caiac.transforms.checks import LateCheck
+from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.indexing import pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 
@@ -411,7 +417,10 @@ class Lookahead:
         Raises:
             KeyError: the batch lacks the steps to its goals, with the rule ``"goal"``.
             RuntimeError: the batch does not consist of these rows, or those of several
-                buffers; or its scores or trajectory ids were changed.
+                buffers; or its scores or trajectory ids were changed. With the rule
+                ``"goal"`` also: no :class:`~torchrl_caiac.transforms.WindowGoal` of the
+                buffer has the same keys.
+            ValueError: next states are several steps later, with the rule ``"goal"``.
         """
         storage = source.storage
         if isinstance(storage, StorageEnsemble):
@@ -452,16 +461,29 @@ class Lookahead:
                     "change them in place, or leave out lookahead"
                 )
         if self.rule == "goal":
-            goal_steps = get_leaf(
-                batch,
-                self.keys.goal_steps,
-                "lookahead='goal' needs the steps to the goal of each row, but the "
-                "batch lacks",
-                "append WindowGoal before this transform, or use lookahead='next'",
-            )
             competing = self._competes.to(device)
-            found = locked_entities(found, goal_steps, competing)
+            found = locked_entities(found, self._goal_steps(source, batch), competing)
         return found | replaced.unsqueeze(-1), differs if late else None
+
+    def _goal_steps(self, source: ReplayBuffer, batch: TensorDictBase) -> torch.Tensor:
+        """Returns the steps to the goals that the buffer drew for a batch."""
+        remedy = "append WindowGoal before this transform, or use lookahead='next'"
+        drawing = [
+            part for part in source.transform.modules() if isinstance(part, WindowGoal)
+        ]
+        if not any(part.keys == self.keys for part in drawing):
+            raise RuntimeError(
+                "lookahead='goal' needs goals that the buffer draws: "
+                + ("pass the same keys= to WindowGoal" if drawing else remedy)
+            )
+        if batch.get(STEPS_KEY, None) is not None:
+            raise ValueError(
+                f"the batch has {STEPS_KEY!r}, so that its goals are several steps "
+                "after the row that they are of, but lookahead='goal' counts single "
+                "steps: leave out MultiStepTransform, or use a number of steps"
+            )
+        what = "lookahead='goal' needs the steps to the goal of each row, but there is"
+        return get_leaf(batch, self.keys.goal_steps, what, remedy)
 
     def __getstate__(self) -> dict[str, Any]:
         left_out = ("_tables", "_seen")
