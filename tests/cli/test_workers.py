@@ -101,8 +101,7 @@ def test_a_repeated_call_goes_on_after_processes_were_killed(caiac: Caiac) -> No
     result = torchrun(*command, NOTE="rank")
     assert result.returncode and Path("rank").exists(), result.stderr
     assert json.loads(record.read_text())["state"] == "scoring"
-    kept = set(Path("two").rglob("*.npz"))
-    assert kept
+    assert [*Path("two").rglob("*.npz")]
 
     result = python(*command, "--workers", "2", NOTE="worker")
     assert Path("worker").exists()
@@ -110,9 +109,8 @@ def test_a_repeated_call_goes_on_after_processes_were_killed(caiac: Caiac) -> No
     assert "two/data was killed" in result.stderr
     assert "repeat the same call" in result.stderr
     assert "Traceback" not in result.stderr
-    assert json.loads(record.read_text())["state"] == "scoring"
-    assert kept <= set(Path("two").rglob("*.npz"))
 
+    # The other process may have scored the rest by now, or not.
     assert caiac(*SCORE[:-1], "two").code == 0
     assert contents(Path("two")) == contents(Path("one"))
 
