@@ -24,22 +24,28 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, SliceSampler, TensorStorage
 
-from torchrl_caiac import CAIACTransform, EntityLayout, check_dataset
+from torchrl_caiac import (
+    CAIACTransform,
+    CoDATransform,
+    EntityLayout,
+    check_dataset,
+)
 from torchrl_caiac.data import TransitionWriter, load_transitions, open_dataset
 from torchrl_caiac.data.select_successful import select_successful
 from torchrl_caiac.influence import (
     CAI,
+    AttentionInfluence,
     MotionInfluence,
     score_buffer,
     suggest_thresholds,
 )
-from torchrl_caiac.modules import GaussianWorldModel
+from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
 
@@ -136,6 +142,8 @@ def sampling(kind: str, data: TensorDictBase) -> ReplayBuffer:
         )
         sampler = SliceSampler(slice_len=20, traj_key="episode", cache_values=True)
         return buffer(data, swap, sampler=sampler)
+    if kind == "components":
+        return buffer(data, CoDATransform(LAYOUT, donors=TensorStorage(data)))
     if kind == "lookahead":
         return buffer(data, CAIACTransform(LAYOUT, lookahead="next"))
     if kind == "plain windows":
@@ -148,6 +156,7 @@ SAMPLES = (
     "plain",
     "in the batch",
     "donors",
+    "components",
     "hindsight",
     "lookahead",
     "plain windows",
@@ -156,15 +165,21 @@ SAMPLES = (
 )
 
 
-def score(data: TensorDictBase, cheap: bool) -> None:
-    """Scores all rows, by motion or by a small world model."""
-    if cheap:
-        score_buffer(buffer(data), MotionInfluence(LAYOUT, MOVES), progress=False)
-        return
-    model = GaussianWorldModel(LAYOUT, action_dim=4, hidden_sizes=(8,))
-    model.fitted = True  # what it predicts does not matter here
-    key = ("cai", "score")
-    score_buffer(buffer(data), CAI(model, num_actions=2), key=key, progress=False)
+def score(data: TensorDictBase, kind: Literal["motion", "cai", "coda"]) -> None:
+    """Scores all rows, by motion or by a small model; what it predicts is no matter."""
+    estimator: Callable[[TensorDictBase], torch.Tensor]
+    estimator, key = MotionInfluence(LAYOUT, MOVES), ("caiac", "score")
+    if kind == "cai":
+        model = GaussianWorldModel(LAYOUT, action_dim=4, hidden_sizes=(8,))
+        model.fitted = True
+        estimator, key = CAI(model, num_actions=2), ("cai", "score")
+    elif kind == "coda":
+        transformer = TransformerWorldModel(
+            LAYOUT, action_dim=4, layers=1, heads=1, width=8
+        )
+        transformer.fitted = True
+        estimator, key = AttentionInfluence(transformer), ("coda", "graph")
+    score_buffer(buffer(data), estimator, key=key, progress=False)
 
 
 def steps(folder: Path, work: Path) -> dict[str, Callable[[TensorDictBase], Call]]:
@@ -174,9 +189,10 @@ def steps(folder: Path, work: Path) -> dict[str, Callable[[TensorDictBase], Call
         "open_dataset": lambda data: lambda: open_dataset(str(folder), work / "x"),
         "trajectory_index": lambda data: lambda: trajectory_index(data),
         "check_dataset": lambda data: lambda: check_dataset(data, LAYOUT),
-        "score_buffer, motion": lambda data: lambda: score(data, True),
-        "score_buffer again": lambda data: lambda: score(data, True),
-        "score_buffer, CAI": lambda data: lambda: score(data, False),
+        "score_buffer, motion": lambda data: lambda: score(data, "motion"),
+        "score_buffer again": lambda data: lambda: score(data, "motion"),
+        "score_buffer, CAI": lambda data: lambda: score(data, "cai"),
+        "score_buffer, CoDA": lambda data: lambda: score(data, "coda"),
         "suggest_thresholds": lambda data: lambda: suggest_thresholds(data, LAYOUT),
         "select_successful": lambda data: (
             lambda: select_successful(
