@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fnmatch
 import json
 import logging
 import os
@@ -19,6 +20,7 @@ from filelock import FileLock, Timeout
 
 from torchrl_caiac._whole_files import (
     has_ended,
+    naming_full_disk,
     remove_leftovers,
     remove_leftovers_in,
     this_process,
@@ -30,6 +32,7 @@ __all__ = [
     "UnreadableFileError",
     "check_archive",
     "claim_folder",
+    "meta_state",
     "plain",
     "read_json",
     "recover_meta",
@@ -175,7 +178,7 @@ def safe_meta(folder: str | os.PathLike[str]) -> Iterator[None]:
         yield
         return
     recover_meta(root)
-    files = [file for file in sorted(root.rglob(_META)) if file.is_file()]
+    files = sorted(_find(root, _META))
     damaged = [str(file) for file in files if not _is_json(file)]
     if damaged:
         raise UnreadableFileError(
@@ -227,7 +230,7 @@ def recover_meta(folder: str | os.PathLike[str]) -> bool:
     for _ in range(_TRIES):
         if not _has_damage(root):
             return False
-        running = set(root.rglob(_COPIES))
+        running = set(_find(root, _COPIES))
         copies = _ended_copies(root)
         running.difference_update(copies)
         if not running:
@@ -254,6 +257,30 @@ def recover_meta(folder: str | os.PathLike[str]) -> bool:
     return True
 
 
+def meta_state(folder: str | os.PathLike[str]) -> dict[str, tuple[int, int]]:
+    """Returns a value that differs after a leaf was added to a folder.
+
+    Args:
+        folder (path): the outermost folder of a memory-mapped tensordict.
+
+    Returns:
+        dict: the time and size of every ``meta.json``.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_caiac._files import meta_state
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     meta_state(folder)
+        {}
+    """
+    found = {}
+    for file in _find(Path(folder), _META):
+        with suppress(FileNotFoundError):
+            status = file.stat()
+            found[str(file)] = status.st_mtime_ns, status.st_size
+    return found
+
+
 def _restore(root: Path, copies: Sequence[Path]) -> None:
     # All, not only the damaged one: an outer file may list what an inner one lost.
     for copy in copies:
@@ -261,7 +288,7 @@ def _restore(root: Path, copies: Sequence[Path]) -> None:
             with whole_file(copy.with_name(_META)) as partial:
                 shutil.copyfile(copy, partial)
     before = {copy.with_name(_META) for copy in copies}
-    for file in root.rglob(_META):
+    for file in _find(root, _META):
         if file not in before and not _is_json(file):
             file.unlink()  # of the leaf; no other file lists it any more
 
@@ -269,24 +296,35 @@ def _restore(root: Path, copies: Sequence[Path]) -> None:
 def _ended_copies(root: Path) -> list[Path]:
     """Returns the copies that processes left which have ended."""
     ended = []
-    for copy in root.rglob(_COPIES):
+    for copy in _find(root, _COPIES):
         process = copy.name.removeprefix(f"{_META}.").removesuffix(".bak")
         over = has_ended(process)
         if over is None:  # of another machine: a leaf is added in far less time
-            over = time.time() - copy.stat().st_mtime > _SECONDS_TO_ADD_A_LEAF
+            with suppress(FileNotFoundError):  # it has ended meanwhile
+                age = time.time() - copy.stat().st_mtime
+                over = age > _SECONDS_TO_ADD_A_LEAF
         if over and root not in _guarded:
             ended.append(copy)
     return ended
 
 
 def _has_damage(root: Path) -> bool:
-    return not all(_is_json(file) for file in root.rglob(_META) if file.is_file())
+    return not all(_is_json(file) for file in _find(root, _META))
+
+
+def _find(root: Path, pattern: str) -> list[Path]:
+    """Returns the files with such a name, while others may remove folders."""
+    return [
+        Path(folder, name)
+        for folder, _, names in os.walk(root)
+        for name in fnmatch.filter(names, pattern)
+    ]
 
 
 def _is_json(file: Path) -> bool:
     try:
         return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
-    except (ValueError, RecursionError):
+    except (FileNotFoundError, ValueError, RecursionError):
         return False
 
 
@@ -456,7 +494,8 @@ def claim_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
             f"{name} is using {folder}: wait for it, stop it, or give another folder"
         ) from None
     try:
-        owner.write_text(f"process {os.getpid()} on {platform.node()}", "utf-8")
+        with naming_full_disk(owner):
+            owner.write_text(f"process {os.getpid()} on {platform.node()}", "utf-8")
         yield
     finally:
         owner.unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import platform
 import re
@@ -16,6 +17,7 @@ from pathlib import Path
 
 __all__ = [
     "has_ended",
+    "naming_full_disk",
     "remove_leftovers",
     "remove_leftovers_in",
     "this_process",
@@ -25,6 +27,7 @@ __all__ = [
 
 _PARTIAL = ".partial-"
 _REPLACED = "replaced-"
+_NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 # The partial files and folders of this process, as absolute paths.
 _in_use: set[Path] = set()
 # No name is used twice: a thread that has listed the old file would remove the new one.
@@ -62,7 +65,7 @@ def whole_file(path: str | os.PathLike[str], *, tidy: bool = True) -> Iterator[P
     path.parent.mkdir(parents=True, exist_ok=True)
     if tidy:
         remove_leftovers(path)
-    with _partial(path) as partial:
+    with _partial(path) as partial, naming_full_disk(path):
         try:
             yield partial
             os.replace(partial, path)
@@ -115,6 +118,40 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
                 raise
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def naming_full_disk(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Context manager that names a file in the error of a full disk.
+
+    Args:
+        path (path): what is written in the block.
+
+    Raises:
+        OSError: with ``errno.ENOSPC``, the disk is full.
+
+    Examples:
+        >>> from torchrl_caiac._whole_files import naming_full_disk
+        >>> try:
+        ...     with naming_full_disk("/dev/full"), open("/dev/full", "w") as file:
+        ...         _ = file.write("42")
+        ... except OSError as error:
+        ...     str(error).partition(",")[0]
+        '[Errno 28] the disk is full: /dev/full could not be written'
+    """
+    try:
+        yield
+    except OSError as error:
+        # Others say more.
+        if error.errno not in _NO_SPACE or error.strerror != os.strerror(error.errno):
+            raise
+        folder = Path(path).absolute().parent
+        raise OSError(
+            errno.ENOSPC,
+            f"the disk is full: {path} could not be written, {folder} has "
+            f"{shutil.disk_usage(folder).free} bytes left: make space, and repeat the "
+            "call",
+        ) from error
 
 
 @contextmanager

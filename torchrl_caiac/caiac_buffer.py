@@ -54,7 +54,8 @@ class CAIACReplayBuffer(TensorDictReplayBuffer):
     the actor. With Ray, all arguments have to be picklable: use functions of modules
     and :func:`functools.partial`.
 
-    With the same ``seed``, the buffer returns the same batches here and in an actor.
+    With the same ``seed``, the buffer returns the same batches here and in an actor,
+    unless ``prefetch`` is above 1: then several threads draw from one generator.
 
     Args:
         data (str, Path or callable): the folder of transitions, opened with

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -17,6 +18,8 @@ from torchrl_caiac._files import safe_meta
 from torchrl_caiac.data import UnreadableFileError
 from torchrl_caiac.data.digests import write_digests
 from torchrl_caiac.data.load_transitions import load_transitions
+
+load_module = importlib.import_module("torchrl_caiac.data.load_transitions")
 
 
 def rows(n=6):
@@ -304,6 +307,21 @@ def test_a_killed_addition_of_a_leaf_is_undone(tmp_path, caplog):
     loaded = load_transitions(tmp_path)
     loaded.make_memmap(("caiac", "score"), shape=[6, 2]).fill_(3.0)
     assert (load_transitions(tmp_path)["caiac", "score"] == 3).all()
+
+
+def test_a_leaf_that_is_added_meanwhile_is_waited_for(tmp_path, monkeypatch):
+    folder = tmp_path / "data"
+    rows().memmap(folder)
+    meta = folder / "meta.json"
+    content = meta.read_text()
+    written = iter(["", content[:40], content + " "])
+
+    def recover_meta(path):  # the last moment before the folder is read
+        meta.write_text(next(written))
+
+    monkeypatch.setattr(load_module, "recover_meta", recover_meta)
+    assert load_transitions(folder).shape == (6,)
+    assert not [*written]
 
 
 def test_a_read_only_folder_is_read(read_only, tmp_path):

@@ -149,7 +149,7 @@ def test_hindsight_goals_without_a_sample_unit_are_refused() -> None:
     with pytest.raises(RuntimeError, match="no future goals were drawn"):
         mixed.sample()
     ensemble = ReplayBufferEnsemble(buffer(0), buffer(1000), batch_size=40)
-    with pytest.raises(RuntimeError, match="no future goals were drawn"):
+    with pytest.raises(RuntimeError, match=r"ReplayBufferEnsemble .* by itself"):
         ensemble.sample()
 
 

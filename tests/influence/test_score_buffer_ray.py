@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
+import ray
 import torch
 from tensordict import TensorDict, TensorDictBase
 
@@ -79,6 +81,24 @@ def test_an_error_of_a_task_is_raised(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="these states cannot be scored"):
         score_buffer_ray(
             folder, Fatal(error=True), num_workers=1, check=False, progress=False
+        )
+
+
+def test_a_cluster_that_is_too_small_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wait(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ray, "wait", wait)
+    needs = r"needs \{'CPU': 1, 'GPU': 7\}.*they have \[\{'CPU': 2.0, 'GPU': 0\}\]"
+    with pytest.warns(UserWarning, match=needs), pytest.raises(KeyboardInterrupt):
+        score_buffer_ray(
+            write(tmp_path / "rows", 300),
+            Fatal(),
+            num_workers=1,
+            resources={"num_gpus": 7},
+            progress=False,
         )
 
 

@@ -28,6 +28,7 @@ from tests.influence.scoring import (
 )
 from torchrl_caiac.data import load_transitions, offline_buffer
 from torchrl_caiac.influence import score_buffer
+from torchrl_caiac.influence.score_parts import ScoreParts, new_plan
 
 PARTS = "caiac.score.parts"
 
@@ -144,6 +145,38 @@ def test_clocks_that_are_wrong_stop_nobody(seconds: int, tmp_path: Path) -> None
     (parts / f"{plan}-abc.npz").touch()  # of another program
     score(tmp_path / "rows")
     assert leaf_bytes(tmp_path / "rows") == leaf_bytes(whole)
+
+
+@pytest.mark.parametrize("row", range(20, 30))
+def test_rows_that_change_between_two_calls_are_found(row: int, tmp_path: Path) -> None:
+    for name, calls in (("rows", 6), ("whole", -1)):
+        folder = tmp_path / name
+        episodes((30, 20, 50)).memmap(folder)
+        settings = {"smoothing": 5, "shard": (0, 2), "check": False, "progress": False}
+        if calls > 0:  # the rows up to 23 are scored
+            with pytest.raises(KeyboardInterrupt):
+                score_buffer(opened(folder), Failing(calls), 4, **settings)
+        data = load_transitions(folder)
+        data["observation"][row] += 3.0
+        score_buffer(opened(folder), Failing(-1), 4, **settings)
+    assert leaf_bytes(tmp_path / "rows") == leaf_bytes(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("content", [b"\0\0", b"\xff\xfe", b"a/../../b"], ids=repr)
+def test_a_claim_that_a_crash_damaged_is_taken_over(
+    content: bytes, tmp_path: Path
+) -> None:
+    parts = ScoreParts.of(tmp_path, "score")
+    plan = new_plan({}, {"batch_size": 4, "rows": 4}, (2,), None, 1)
+    parts.write(plan, None)
+    with parts.taking_part():
+        parts.enter()
+        assert parts.claim(plan, 0) == 0
+        (claim,) = parts.root.glob("*.claim")
+        claim.write_bytes(content)
+        os.utime(claim, (time.time() - 3600,) * 2)
+        assert parts.take_over(plan) == 0
+        assert claim.read_text() == parts.member
 
 
 def test_scored_folders_may_be_read_only(

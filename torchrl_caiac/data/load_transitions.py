@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._files import (
     UnreadableFileError,
+    meta_state,
     read_json,
     recover_meta,
     remove_leftovers,
@@ -27,6 +28,7 @@ _KEYS: tuple[NestedKey, ...] = ("action", "episode", ("next", "done"))
 # What meta.json has besides the entries.
 _COMMON = {"shape", "device", "_type"}
 
+_TRIES = 20  # to read a folder while other processes add leaves
 _AGAIN = "delete the folder and create the data again"
 
 
@@ -86,7 +88,20 @@ def load_transitions(
             f"the folder {path} does not exist: create the data first, for example "
             "with load_minari"
         )
-    recover_meta(path)
+    for left in reversed(range(_TRIES)):
+        before = meta_state(path)
+        recover_meta(path)
+        try:
+            return _open(path, keys, verify)
+        except UnreadableFileError:
+            # Perhaps it was read while another process added a leaf.
+            if not left or meta_state(path) == before:
+                raise
+    raise AssertionError
+
+
+def _open(path: Path, keys: Iterable[NestedKey], verify: bool) -> TensorDict:
+    """Opens a folder, after checking it."""
     leaves: set[tuple[str, ...]] = set()
     try:
         shape = _check_folder(path, path, [], leaves)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tensordict.utils import NestedKey
+from torch import nn
 from tqdm.auto import tqdm
 
 from torchrl_caiac._checks import check_int
@@ -52,7 +54,9 @@ def score_buffer_ray(
     Keyword Args:
         num_workers (int): the number of tasks, at least 1.
         resources (mapping, optional): what each task occupies, as in ``ray.remote``,
-            such as ``{"num_cpus": 1, "num_gpus": 0.5}``. Defaults to ``None``: one CPU.
+            such as ``{"num_cpus": 1, "num_gpus": 0.5}``. A task that has a GPU moves
+            an estimator that is a module there. A warning says so if no node has them.
+            Defaults to ``None``: one CPU.
         max_retries (int): how often a killed task is started again. Defaults to 3.
         key (NestedKey): the leaf to write. Defaults to ``("caiac", "score")``.
         progress (bool): show a progress bar of all tasks. Defaults to ``True``.
@@ -84,6 +88,7 @@ def score_buffer_ray(
         ray.init(include_dashboard=False)
     options = {"num_cpus": 1, **(resources or {}), "max_retries": max_retries}
     task = ray.remote(**options)(_score_shard)
+    _warn_if_too_large(options)
     # Once for all tasks.
     settings = ray.put((estimator, {**kwargs, "key": key}))
     waiting = [
@@ -105,10 +110,33 @@ def score_buffer_ray(
                 ray.cancel(reference, force=True)
 
 
+def _warn_if_too_large(options: Mapping[str, Any]) -> None:
+    """Warns if no node of the cluster has what a task occupies."""
+    import ray
+
+    names = {"num_cpus": "CPU", "num_gpus": "GPU", "memory": "memory"}
+    needed = {new: options[old] for old, new in names.items() if options.get(old)}
+    needed |= options.get("resources") or {}
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if not any(all(node.get(n, 0) >= needed[n] for n in needed) for node in nodes):
+        found = [{name: node.get(name, 0) for name in needed} for node in nodes]
+        warnings.warn(
+            f"each task needs {needed}, and no node of the cluster has that, they have "
+            f"{found}: the tasks wait until such a node joins. Interrupt this call, "
+            "and give other resources=, unless the cluster adds nodes by itself",
+            stacklevel=3,
+        )
+
+
 def _score_shard(
     path: Path, settings: tuple[Any, dict[str, Any]], shard: tuple[int, int]
 ) -> None:
     """Runs in a task of Ray."""
+    import ray
+
     estimator, kwargs = settings
+    gpus = ray.get_runtime_context().get_accelerator_ids().get("GPU")
+    if gpus and isinstance(estimator, nn.Module):
+        estimator = estimator.to("cuda")
     rb = offline_buffer(load_transitions(path))
     score_buffer(rb, estimator, progress=False, shard=shard, **kwargs)

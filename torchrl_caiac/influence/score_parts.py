@@ -15,10 +15,10 @@ range, for example because one of them was suspended, both write the same bytes.
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import platform
+import re
 import shutil
 import threading
 import time
@@ -41,7 +41,7 @@ from torchrl_caiac._files import (
     read_json,
     write_json,
 )
-from torchrl_caiac._whole_files import has_ended, this_process
+from torchrl_caiac._whole_files import has_ended, naming_full_disk, this_process
 from torchrl_caiac.influence.score_record import score_file
 
 __all__ = ["Plan", "ScoreParts", "new_plan", "refuse_members"]
@@ -351,7 +351,9 @@ class ScoreParts:
         for number in sorted(self.unfinished(plan)):
             file = self._claim(plan, number)
             try:
-                owner = file.read_text("utf-8")
+                owner = file.read_text("utf-8", "replace")
+                if not re.fullmatch(r"[\w-]*", owner, re.ASCII):  # by a crash
+                    owner = ""
                 # Between its creation and the first byte.
                 is_new = not owner and (
                     self._now() - file.stat().st_mtime < _SECONDS_WITHOUT_SIGN
@@ -385,21 +387,13 @@ class ScoreParts:
         """
         partial = self.root / f".part-{self.member}"
         try:
-            with open(partial, "wb") as stream:
+            with naming_full_disk(partial), open(partial, "wb") as stream:
                 np.savez(
                     stream, scores=scores.numpy(), fingerprints=fingerprints.numpy()
                 )
             os.replace(partial, self._part(plan, number))
         except FileNotFoundError:  # another process has finished all of it
             pass
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
-                raise
-            raise OSError(
-                errno.ENOSPC,
-                f"the disk is full: scores in {self.root} need {scores.nbytes} bytes "
-                "more; what is scored is kept, make space and repeat the call",
-            ) from error
         finally:
             partial.unlink(missing_ok=True)
 
@@ -439,12 +433,17 @@ class ScoreParts:
     def _create(self, file: Path) -> bool:
         """Creates a file that names this process, unless it is there."""
         try:
-            with open(file, "x", encoding="utf-8") as stream:
-                stream.write(str(self.member))
+            descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         except FileExistsError:
             return False
         except FileNotFoundError:  # another process has finished, and removed all files
             return False
+        try:
+            with naming_full_disk(file), open(descriptor, "w", encoding="utf-8") as out:
+                out.write(str(self.member))
+        except OSError:
+            file.unlink(missing_ok=True)
+            raise
         return True
 
     def _numbers(self, plan: Plan, suffix: str) -> set[int]:

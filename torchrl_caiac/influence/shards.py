@@ -220,9 +220,10 @@ def _begin(
     """Returns the plan of all processes, ``None`` if nothing is left to score."""
     geometry = _geometry(own)
     plan = parts.read()
-    if plan is not None and (plan.settings, plan.geometry) == (own.settings, geometry):
-        return plan
+    # Otherwise the data may have changed since, and with them the rows around a change.
     if plan is not None and parts.members():
+        if (plan.settings, plan.geometry) == (own.settings, geometry):
+            return plan
         raise ValueError(
             f"other processes are scoring {own.key!r} in {own.folder} with other "
             "settings: "

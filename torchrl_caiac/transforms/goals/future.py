@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import TensorStorage
+from torchrl.data import ReplayBufferEnsemble, TensorStorage
 from torchrl.data.replay_buffers import SampleUnit
 
 from torchrl_caiac._buffer_transform import RandomTransform
@@ -215,6 +215,27 @@ class FutureGoal(RandomTransform, SampleUnit):
         """
         goals, is_sample = self._pending.__dict__.pop("goals", (None, False))
         return None if is_sample and sampling_buffer() is None else goals
+
+    def no_goals(self, otherwise: str = "") -> RuntimeError:
+        """Returns the error for a batch whose goals were not drawn.
+
+        Args:
+            otherwise (str): what else could be done. Defaults to nothing.
+        """
+        name = type(self).__name__
+        if isinstance(sampling_buffer(), ReplayBufferEnsemble):
+            return RuntimeError(
+                "a ReplayBufferEnsemble samples its buffers without their sample_unit, "
+                f"where {name} draws goals: sample from each buffer by itself, or from "
+                f"two by offline_to_online_buffer{otherwise}"
+            )
+        return RuntimeError(
+            f"no future goals were drawn for this batch: pass the same {name} as "
+            "sample_unit=... of the replay buffer, and get data by rb.sample() "
+            f"(rb.storage[...] reads rows as they are stored){otherwise}. For a buffer "
+            "in another process, create a CAIACReplayBuffer there, since both would be "
+            "sent apart"
+        )
 
     # --- reading ---------------------------------------------------------------------
 

@@ -379,12 +379,8 @@ class HindsightGoal(FutureGoal):
         rows = tensordict.shape[0]
         if self.future > 0:
             if goals is None:
-                raise RuntimeError(
-                    "no future goals were drawn for this batch: pass the same "
-                    "HindsightGoal as sample_unit=... of the replay buffer, and get "
-                    "data by rb.sample(); or give future=0, where goals of the batch "
-                    "are enough. For a buffer in another process, create a "
-                    "CAIACReplayBuffer there, since both would be sent apart"
+                raise self.no_goals(
+                    "; or give future=0, where goals of the batch are enough"
                 )
             for goal in goals.values():
                 if goal.shape[0] != rows:

@@ -267,13 +267,7 @@ class WindowGoal(FutureGoal):
         self.warn_if_forked()
         goals = self.take_goals()
         if goals is None:
-            raise RuntimeError(
-                "no goals were drawn for this batch: pass the same WindowGoal as "
-                "sample_unit=... of the replay buffer, and get data by rb.sample() "
-                "(rb.storage[...] reads rows as they are stored). For a buffer in "
-                "another process, create a CAIACReplayBuffer there, since both would "
-                "be sent apart"
-            )
+            raise self.no_goals()
         if tensordict.get(self.keys.counterfactual, None) is not None:
             raise RuntimeError(
                 "the batch already contains counterfactuals, whose goals would not "
