@@ -4,9 +4,9 @@ Your own dataset
 
 A recording rarely looks as a library expects it. Here a robot has tidied tables, and
 its log has the *x* of all things before their *y*, a clock, the place of one thing
-relative to another, and flags where episodes *begin*. We bring it into TorchRL's format,
-describe the entities, check the data, look at what would be swapped, and clone the
-demonstrator, with and without counterfactuals.
+relative to another, and flags where episodes *begin*. We bring it into TorchRL's
+format, describe the entities, check the data, look at what would be swapped, and clone
+the demonstrator, with and without counterfactuals.
 
 To use your own recording, replace the first section.
 """
@@ -109,15 +109,16 @@ print(inspect_dataset(data))
 # Errors that raise no exception
 # ------------------------------
 # The last two columns describe the mug and the hand at once: after a swap they would
-# still be about the mug before. :func:`~torchrl_caiac.check_dataset` finds such columns.
+# still be about the mug before. :func:`~torchrl_caiac.check_dataset` finds such
+# columns.
 
 names = {"robot": [1, 4], "mug": [2, 5], "box": [3, 6]}
 print(check_dataset(data, EntityLayout(names, fixed=["robot"])))
 
 # %%
-# So we leave them out, and the clock. A policy can compute differences itself, from what
-# it gets after the swap. The layout also says which columns of the goals belong to which
-# thing: goals then follow every swap.
+# So we leave them out, and the clock. A policy can compute differences itself, from
+# what it gets after the swap. The layout also says which columns of the goals belong to
+# which thing: goals then follow every swap.
 
 data = from_arrays(
     sensors[:, 1:7],
@@ -144,8 +145,8 @@ print(check_dataset(data, layout))
 # Scores
 # ------
 # The things rest unless the robot moves them: what moves is influenced, and
-# :class:`~torchrl_caiac.influence.MotionInfluence` needs no model. ``fit`` finds out how
-# large a change is noise.
+# :class:`~torchrl_caiac.influence.MotionInfluence` needs no model. ``fit`` finds out
+# how large a change is noise.
 
 rb = offline_buffer(data, batch_size=256)
 score_buffer(rb, MotionInfluence(layout).fit(rb), lookahead=0, progress=False)
@@ -155,9 +156,9 @@ print(found)
 # %%
 # Look before you train
 # ---------------------
-# :func:`~torchrl_caiac.report.write_report` writes one page about what would be swapped.
-# Do the coloured steps agree with what you know about the recording? Are the examples
-# possible? :doc:`/report` explains each part.
+# :func:`~torchrl_caiac.report.write_report` writes one page about what would be
+# swapped. Do the coloured steps agree with what you know about the recording? Are the
+# examples possible? :doc:`/report` explains each part.
 
 scored = write_scored(
     f"{folder.name}/scored", layout, found, estimator="motion", settings={}
@@ -178,8 +179,8 @@ Frame()
 # %%
 # Training
 # --------
-# A usual loop. Cloning repeats what it has seen, so the thing that the demonstrator goes
-# to next has to stay: ``lookahead="next"``.
+# A usual loop. Cloning repeats what it has seen, so the thing that the demonstrator
+# goes to next has to stay: ``lookahead="next"``.
 
 
 def clone(augmentation: CAIACTransform | None) -> GoalConditionedActor:
