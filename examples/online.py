@@ -35,12 +35,12 @@ from torchrl.modules import AdditiveGaussianModule
 
 from environments.fetch_push import FetchPush
 from score import make_scoring
-from shared.console import start
+from shared.console import Console
 from shared.parts import make_environment, run_folder
 from shared.settings import keep_settings
 from study import prepare
 from torchrl_caiac._figures import colour, finish_results, new_figure
-from torchrl_caiac._files import read_json, whole_file, write_json
+from torchrl_caiac._files import claim_folder, read_json, whole_file, write_json
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.data import (
     load_transitions,
@@ -244,14 +244,17 @@ def draw(path: Path) -> None:
 @hydra.main(version_base=None, config_path="conf", config_name="online")
 def main(cfg: DictConfig) -> None:
     """Runs all methods and seeds."""
-    prepare(cfg)
+    torch.set_num_threads(1)
     path = Path(cfg.publish) / "online.csv"
-    for seed in cfg.seeds:
-        for method in cfg.method:
+    runs = [(method, seed) for seed in cfg.seeds for method in cfg.method]
+    with Console(Path(cfg.out) / "online", stages=3 + len(runs)) as console:
+        prepare(cfg, console)
+        for method, seed in runs:
             folder = run_folder(cfg, method, seed)
-            with start(cfg, folder=folder) as console, console.stage(folder.name):
+            with claim_folder(folder), console.stage(folder.name):
                 write_results(path, [*run(cfg, method, seed)])
             draw(path)
+        console.print(f"results: {path}; figure: {path.with_suffix('.png')}")
 
 
 if __name__ == "__main__":

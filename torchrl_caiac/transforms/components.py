@@ -6,6 +6,7 @@ at most 64 entities. Notation as in :mod:`torchrl_caiac.transforms.draws`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -299,7 +300,7 @@ def component_starts(
 
     All rows of such a window belong to one trajectory, and in none of them the
     component contains the action or a fixed entity. The index takes 4 bytes for each
-    pair of row and component, and at most 8 while it is built.
+    pair of row and component.
 
     Args:
         graphs (torch.Tensor): ``[T, N + 1, N]``, NaN where a row was not scored.
@@ -327,38 +328,41 @@ def component_starts(
     """
     length, _, entities = graphs.shape
     device = graphs.device
-    dtype = torch.int32 if length < 1 << 31 else torch.int64
     never = _packed(fixed.to(device))
     step = min(_CHUNK_ROWS, max(window, _CHUNK_ELEMENTS // (entities * (entities + 1))))
-    parts: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
-    for rows, part in scan_donors(graphs, step, window, trajectories, "graphs"):
-        links, held = _links(part, threshold)
-        joined = _joined(_slid(links, window), _slid(held, window) | never)
-        rows = rows[: joined.shape[0]]
-        leads = _leads(joined)
-        if window > 1 and trajectories is not None:
-            leads &= (trajectories.remaining(rows) >= window - 1).unsqueeze(-1)
-        found, order = joined[leads].sort(stable=True)
-        starts = rows.to(dtype).unsqueeze(-1).expand_as(leads)[leads][order]
-        parts.append((*found.unique_consecutive(return_counts=True), starts))
+
+    def found() -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Yields the rows of each part, and their components, sorted by component."""
+        for rows, part in scan_donors(graphs, step, window, trajectories, "graphs"):
+            links, held = _links(part, threshold)
+            joined = _joined(_slid(links, window), _slid(held, window) | never)
+            rows = rows[: joined.shape[0]]
+            leads = _leads(joined)
+            if window > 1 and trajectories is not None:
+                leads &= (trajectories.remaining(rows) >= window - 1).unsqueeze(-1)
+            own, order = joined[leads].sort(stable=True)
+            yield rows.unsqueeze(-1).expand_as(leads)[leads][order], own
+
+    # Read twice, first to count: a list of all parts would need as much as the index.
+    counted = [own.unique_consecutive(return_counts=True) for _, own in found()]
     empty = torch.empty(0, dtype=torch.int64, device=device)
-    masks, place = torch.cat([empty, *(part[0] for part in parts)]).unique(
+    masks, place = torch.cat([empty, *(own for own, _ in counted)]).unique(
         return_inverse=True
     )
     if not len(masks):  # the index needs at least one component; 0 is none
         one = torch.ones(1, dtype=torch.int64, device=device)
-        return ComponentIndex(one - 1, (one - 1).to(dtype), one - 1, one)
-    counts = torch.cat([part[1] for part in parts])
+        return ComponentIndex(one - 1, (one - 1).int(), one - 1, one)
+    counts = torch.cat([count for _, count in counted])
     size = torch.zeros_like(masks).index_add_(0, place, counts)
     offset = size.cumsum(0) - size
+    dtype = torch.int32 if length < 1 << 31 else torch.int64
     starts = torch.empty(int(size.sum()), dtype=dtype, device=device)
     following = offset.clone()
-    parts.reverse()
-    for own in place.split([len(part[0]) for part in parts[::-1]]):
-        _, count, rows = parts.pop()  # to need little more memory than the index
+    parts = place.split([len(own) for own, _ in counted])
+    for own, (_, count), (rows, _) in zip(parts, counted, found(), strict=True):
         shift = following[own] - (count.cumsum(0) - count)
         here = shift.repeat_interleave(count) + torch.arange(len(rows), device=device)
-        starts[here] = rows
+        starts[here] = rows.to(dtype)
         following[own] += count
     return ComponentIndex(masks, starts, offset, size)
 
