@@ -9,6 +9,7 @@ The learner is a mixture of Gaussians.
 """
 
 import tempfile
+import warnings
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -29,6 +30,7 @@ from torchrl_caiac.influence import MotionInfluence, score_buffer
 
 torch.manual_seed(0)
 torch.set_num_threads(1)
+warnings.filterwarnings("ignore", "entities are free")  # says the same as below
 folder = tempfile.TemporaryDirectory()
 
 # %%
@@ -133,17 +135,21 @@ class BeltInfluence:
 
 # %%
 # Scores of 0 and 1 need no threshold. We know what the gripper held, so we can see how
-# often each estimator says "influenced". Motion takes the belt for the robot.
+# often each estimator says "influenced". Motion takes the belt for the robot, and the
+# package warns of what follows.
 
 estimators = {"motion": MotionInfluence(layout, 1e-3), "belt": BeltInfluence(layout)}
 rb = offline_buffer(data)
 for name, estimator in estimators.items():
-    score_buffer(rb, estimator, lookahead=0, key=("caiac", name), progress=False)
+    with warnings.catch_warnings(record=True) as caught:
+        score_buffer(rb, estimator, lookahead=0, key=("caiac", name), progress=False)
     influenced = rb.storage[:]["caiac", name][:, 1:] > 0.05
     print(
         f"{name}: influenced in {influenced[held].float().mean():.0%} of the rows in "
         f"which a part is held, and in {influenced[~held].float().mean():.0%} of others"
     )
+    for warning in caught:
+        print("warning:", warning.message)
 
 # %%
 # The same along one demonstration. Grey is what the gripper held.
@@ -224,8 +230,8 @@ policies = {
 }
 
 # %%
-# All three policies play the same 200 new episodes. Motion hardly frees part B: it
-# rides on the belt while part A is brought to its goal.
+# All three policies play the same 200 new episodes. With motion, part B is never
+# swapped: it rides on the belt while part A is brought to its goal.
 
 tables, goals = start(200)
 desired = torch.tensor(goals.reshape(200, 4)).float()
