@@ -125,6 +125,7 @@ def collect(policy: TensorDictModuleBase, tables: int) -> tuple[TensorDictBase, 
         frames_per_batch=60 * tables,
         total_frames=60 * tables,
         set_truncated=True,
+        auto_register_policy_transforms=False,  # the noise is constant
     )
     (played,) = (batch.clone() for batch in collector)
     collector.shutdown()
