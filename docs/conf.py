@@ -81,6 +81,7 @@ sphinx_gallery_conf = {
     "examples_dirs": "tutorials",
     "gallery_dirs": "auto_tutorials",
     "filename_pattern": r"plot_",
+    "within_subsection_order": "gallery_figures.tutorial_order",
     "image_scrapers": ("gallery_figures.save_figures", "matplotlib"),
     "ignore_repr_types": r"matplotlib\.figure",
     "remove_config_comments": True,

@@ -1,4 +1,4 @@
-"""Shows figures of torchrl_caiac.plotting, which pyplot does not know, in tutorials."""
+"""The order of the tutorials, and their figures that pyplot does not know."""
 
 from __future__ import annotations
 
@@ -9,7 +9,22 @@ from matplotlib import pyplot
 from matplotlib.figure import Figure
 from sphinx_gallery.scrapers import figure_rst
 
+_ORDER = (
+    "first_counterfactuals",
+    "own_dataset",
+    "thresholds",
+    "kitchen_skills",
+    "fetch_push_cloning",
+    "own_parts",
+    "online",
+    "past_one_machine",
+)
 _SEEN: weakref.WeakSet[Figure] = weakref.WeakSet()
+
+
+def tutorial_order(file: str) -> int:
+    """Returns the place of a tutorial in the gallery."""
+    return _ORDER.index(file.removeprefix("plot_").removesuffix(".py"))
 
 
 def save_figures(
