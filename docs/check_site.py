@@ -93,7 +93,8 @@ def look(site: Path) -> list[str]:
     )
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=site))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    with tempfile.TemporaryDirectory() as profile:
+    # Children of the browser may write for a moment after it has ended.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         command = [
             os.environ.get("CHROMIUM")
             or next(filter(None, map(shutil.which, BROWSERS))),
