@@ -40,6 +40,7 @@ __all__ = [
     "is_in_another_process",
     "is_in_order_of_time",
     "last_written",
+    "lazy_rows",
     "leaf_of",
     "loss_masks",
     "mark_memmap",
@@ -443,26 +444,19 @@ def _node(td: TensorDict, entries: dict[str, Any], size: torch.Size) -> TensorDi
 
 
 def rows_of(td: Any, rows: Tensor) -> Any:
-    """Returns ``td[rows]``, read by ``index_select``, in half of the time.
-
-    Args:
-        td (TensorDictBase): the tensordict, ``[T]``.
-        rows (torch.Tensor): int64 ``[B]``, not negative.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_caiac._torchrl import rows_of
-        >>> td = TensorDict({"a": torch.arange(3)}, [3])
-        >>> rows_of(td, torch.tensor([2, 0]))["a"]
-        tensor([2, 0])
-    """
+    """Returns ``td[rows]``, int64 ``[B]``, not negative, in half of the time."""
     if type(td) in (Tensor, MemoryMappedTensor):
         return td.as_subclass(Tensor).index_select(0, rows)
     if type(td) is not TensorDict:
         return td[rows]
     entries = {name: rows_of(entry, rows) for name, entry in td._tensordict.items()}
     return _node(td, entries, torch.Size([len(rows), *td.batch_size[1:]]))
+
+
+def lazy_rows(td: TensorDictBase, rows: Tensor) -> TensorDictBase:
+    """Returns ``td[rows]``, of which entries are read when they are asked for."""
+    found: TensorDictBase = td._get_sub_tensordict(rows)
+    return found
 
 
 # --- memory-mapped tensordicts -------------------------------------------------------

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import SliceSampler, TensorStorage
+from torchrl.data import SliceSampler, TensorDictReplayBuffer, TensorStorage
 
 from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import EntityLayout
@@ -95,6 +95,33 @@ def test_rows_are_those_of_a_tensor_storage(mapped, index, tmp_path):
     if isinstance(index, torch.Tensor):
         found.apply_(lambda leaf: leaf.zero_())  # a copy
     assert (data == before).all()
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("flags", [[], ["done"], ["done", "terminated", "is_init"]])
+@pytest.mark.parametrize("truncated", [None, ("next", "truncated")])
+def test_slices_are_those_of_a_tensor_storage(mapped, flags, truncated, tmp_path):
+    data = rows()
+    done = data["next"].pop("done")
+    for name in flags:
+        data["next", name] = done
+    data["is_init"] = done.roll(1)
+    if mapped:
+        data = data.memmap(tmp_path)
+    found = []
+    for kind in (TensorStorage, OfflineStorage):
+        torch.manual_seed(0)
+        sampler = SliceSampler(slice_len=3, traj_key="episode", truncated_key=truncated)
+        rb = TensorDictReplayBuffer(storage=kind(data), sampler=sampler, batch_size=9)
+        found.append(rb.sample(return_info=True))
+    (wanted, wanted_info), (batch, info) = found
+    assert set(batch.keys(True, True)) == set(wanted.keys(True, True))
+    assert (batch == wanted).all()
+    assert batch["is_init"].view(3, 3)[:, 0].all()
+    assert set(info) == set(wanted_info)
+    for key, value in wanted_info.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(info[key], value) and type(info[key]) is type(value)
 
 
 def test_it_cannot_be_extended():

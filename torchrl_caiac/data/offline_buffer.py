@@ -9,7 +9,12 @@ from tensordict import TensorDictBase
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 
-from torchrl_caiac._torchrl import rows_of, storage_data
+from torchrl_caiac._torchrl import (
+    lazy_rows,
+    rows_of,
+    sampling_buffer,
+    storage_data,
+)
 from torchrl_caiac.data.add_leaf import store_leaves
 
 __all__ = ["OfflineStorage", "offline_buffer", "offline_storage"]
@@ -31,19 +36,33 @@ class OfflineStorage(TensorStorage):
 
     def get(self, index: Any) -> Any:
         """Returns rows, see :class:`~torchrl.data.TensorStorage`."""
+        rows = self._rows(index)
+        if rows is not None:
+            try:
+                return rows_of(storage_data(self), rows)
+            except IndexError:  # negative, or too large
+                pass
+        return super().get(index)
+
+    def __getitem__(self, index: Any) -> Any:
+        # Samplers of slices look for flags of the rows that they drew.
+        rows = self._rows(index) if isinstance(index, tuple) else None
+        if rows is not None and sampling_buffer() is not None:
+            return lazy_rows(storage_data(self), rows)
+        return super().__getitem__(index)
+
+    def _rows(self, index: Any) -> torch.Tensor | None:
+        """Returns the rows ``[B]`` of an index on the CPU, ``None`` of another one."""
         rows = index[0] if isinstance(index, tuple) and len(index) == 1 else index
         if (
             isinstance(rows, torch.Tensor)
             and (rows.ndim, rows.dtype) == (1, torch.int64)
             and {rows.device.type, torch.device(self.device).type} == {"cpu"}
+            and self.ndim == 1
+            and len(self) == len(storage_data(self))
         ):
-            data = storage_data(self)
-            try:
-                if len(self) == len(data):
-                    return rows_of(data, rows)
-            except IndexError:  # negative, or too large
-                pass
-        return super().get(index)
+            return rows
+        return None
 
 
 def offline_buffer(
