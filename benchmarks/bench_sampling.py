@@ -283,7 +283,7 @@ def bench_windows(
     """500 windows of 20 and of 10, 10 entities."""
     setting = made(WINDOWS, 500, rows, kind, folder, device)
     calls = setting.calls()
-    # LMP reads no end flags, for which SliceSampler would read all rows once more.
+    # LMP reads no end flags.
     short = replace(setting, window=10, sampler={"truncated_key": None})
     calls["short"] = short.with_goals().sample
     times = seconds(calls | setting.offline_calls(), rounds=60)
