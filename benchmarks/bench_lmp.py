@@ -19,9 +19,10 @@ from collections.abc import Callable
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
+from torchrl.data import ReplayBuffer, SliceSampler
 
 from benchmarks.ratios import seconds
+from torchrl_caiac.data.offline_buffer import offline_storage
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules.lmp import LMPModel
 from torchrl_caiac.objectives.lmp import LMPLoss
@@ -77,12 +78,11 @@ def make_buffer(
     )
     goals = WindowGoal(layout, window)
     rb = ReplayBuffer(
-        storage=LazyTensorStorage(rows, device=device),
+        storage=offline_storage(data.to(device)),
         sampler=SliceSampler(slice_len=window, traj_key="episode", cache_values=True),
         sample_unit=goals,
         batch_size=windows * window,
     )
-    rb.extend(data)
     rb.append_transform(goals)
     if swap:
         rb.append_transform(CAIACTransform(layout, threshold=0.3, window=window))

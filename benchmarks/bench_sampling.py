@@ -8,7 +8,8 @@ largest storage takes 4 GB of disk or memory. The example samples four batches o
 transitions at once, which is timed too. With ``--device=cuda`` there are storages
 on the GPU too; samples of the others are moved there before all transforms.
 
-Ratios are to the same sample without the transform, all timed in turns. One ratio has
+Ratios are to the same sample without the transform, all timed in turns, from TorchRL's
+``TensorStorage``. The storage of ``offline_buffer`` is compared with it. One ratio has
 another divisor: 4,900 windows per second, the rate of the authors' sampler, measured on
 another machine of ours.
 """
@@ -31,6 +32,8 @@ from torchrl.data import ReplayBuffer, SliceSampler, TensorStorage
 from benchmarks.ratios import seconds
 from torchrl_caiac import EntityLayout
 from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
+from torchrl_caiac._torchrl import storage_data
+from torchrl_caiac.data.offline_buffer import offline_storage
 from torchrl_caiac.transforms import CAIACTransform, HindsightGoal, WindowGoal
 
 EPISODE = 100
@@ -93,6 +96,10 @@ class Setting:
             rb.append_transform(transform)
         return rb
 
+    def offline(self) -> Setting:
+        """The same rows in the storage of ``offline_buffer``."""
+        return replace(self, storage=offline_storage(storage_data(self.storage)))
+
     def calls(self, goals: bool = True) -> dict[str, Callable[[], Any]]:
         """Samples without the transform, with it, and with goals or other donors."""
         plain, swap = self.buffer(), self.buffer(self.caiac())
@@ -110,6 +117,14 @@ class Setting:
         if goals and self.window == 1:
             calls["lookahead"] = self.buffer(self.caiac(lookahead="next")).sample
         return calls
+
+    def offline_calls(self) -> dict[str, Callable[[], Any]]:
+        """Plain samples, and those with goals and swap, of :meth:`offline`."""
+        setting = self.offline()
+        return {
+            "offline": setting.buffer().sample,
+            "offline goals": setting.with_goals().sample,
+        }
 
     def caiac(self, **kwargs: Any) -> CAIACTransform:
         """The transform for this layout and window."""
@@ -239,12 +254,10 @@ def bench_transitions(
 ) -> None:
     """512 transitions, 3 entities; and four such batches in one sample."""
     setting = made(TRANSITIONS, 512, rows, kind, folder, device)
-    calls = setting.calls()
-    for what, some, rounds in (
-        ("512", calls, 600),
-        ("4 x 512", replace(setting, windows=4 * 512).calls(), 150),
-    ):
-        times = seconds(some, rounds=rounds, warmup=20)
+    for what, size, rounds in (("512", 512, 600), ("4 x 512", 4 * 512, 150)):
+        some = replace(setting, windows=size)
+        times = seconds(some.calls() | some.offline_calls(), rounds=rounds, warmup=20)
+        judge_offline(judge, f"{what} transitions", times, f"{rows} {kind}")
         for name, target in (
             ("swap", 1.5),
             ("lookahead", 2.0),
@@ -260,7 +273,7 @@ def bench_transitions(
                 judge(label, added, at_most=target)
         label = f"{what} transitions, fingerprints compared / not, {rows} {kind}"
         judge(label, times["swap"] / times["trusted"], at_most=1.05)
-    benchmark.pedantic(calls["swap"], rounds=50)
+    benchmark.pedantic(setting.buffer(setting.caiac()).sample, rounds=50)
 
 
 @pytest.mark.parametrize("rows", ROWS)
@@ -270,9 +283,11 @@ def bench_windows(
     """500 windows of 20 and of 10, 10 entities."""
     setting = made(WINDOWS, 500, rows, kind, folder, device)
     calls = setting.calls()
-    # LMP reads no end flags, for which SliceSampler would read all rows once more.
+    # LMP reads no end flags.
     short = replace(setting, window=10, sampler={"truncated_key": None})
-    times = seconds(calls | {"short": short.with_goals().sample}, rounds=60)
+    calls["short"] = short.with_goals().sample
+    times = seconds(calls | setting.offline_calls(), rounds=60)
+    judge_offline(judge, "500 windows of 20", times, f"{rows} {kind}")
     for name in ("swap", "goals", "donors"):
         label = f"500 windows of 20, {LABELS[name]} / plain, {rows} {kind}"
         judge(label, times[name] / times["plain"], at_most=1.2)
@@ -282,6 +297,16 @@ def bench_windows(
     label = f"windows of 10 a second, goals and swap / quoted 4,900, {rows} {kind}"
     judge(label, rate, at_least=20)
     benchmark.pedantic(calls["swap"], rounds=20)
+
+
+def judge_offline(judge: Any, what: str, times: dict[str, float], where: str) -> None:
+    """Judges the storage of ``offline_buffer`` by plain samples of a TensorStorage."""
+    for name, label, target in (
+        ("offline", "plain, offline_buffer", 0.7),
+        ("offline goals", "goals and swap, offline_buffer", 1.6),
+    ):
+        ratio = times[name] / times["plain"]
+        judge(f"{what}, {label} / plain, {where}", ratio, at_most=target)
 
 
 class Operations(TorchDispatchMode):

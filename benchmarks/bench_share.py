@@ -3,7 +3,8 @@
 Run with ``pytest benchmarks/bench_share.py --benchmark-only --ratios=<folder>``, in
 ``make bench`` too. A TD3 step is that of ``bench_td3`` (half of two critic updates, one
 of the policy and one of the targets) on transitions of Fetch-Push from 1 M rows; the
-example samples four batches at once, which is measured too. A step of LMP is that of
+example samples four batches at once, which is measured too. Both buffers have the
+storage of ``offline_buffer``, as the examples have. A step of LMP is that of
 ``bench_lmp``, on windows of the kitchen from 6,000 rows. The share is the time of
 ``rb.sample()`` with swaps and goals, in that of sample and step together. The second
 ratio leaves out what the sample of a buffer without transforms takes.
@@ -29,9 +30,8 @@ def transitions(request: pytest.FixtureRequest, tmp_path_factory: Any) -> Settin
     """Transitions of Fetch-Push from a storage of 1 M rows on the device."""
     device = torch.device(request.config.getoption("--device"))
     kind = "memory" if device.type == "cpu" else "cuda"
-    return made(
-        TRANSITIONS, 512, "1M", kind, Path(tmp_path_factory.getbasetemp()), device
-    )
+    folder = Path(tmp_path_factory.getbasetemp())
+    return made(TRANSITIONS, 512, "1M", kind, folder, device).offline()
 
 
 @DTYPE

@@ -304,6 +304,17 @@ def test_with_leaves_is_a_copy_with_leaves(kind, device):
         fence.with_leaves(td, {("next", "a"): torch.ones(3)})
 
 
+@KINDS
+def test_rows_of_are_those_of_an_index(kind):
+    td = batch_of(kind)
+    picked = torch.tensor([1, 0, 1])
+    wanted, found = td[picked], fence.rows_of(td, picked)
+    assert set(found.keys(True)) == set(wanted.keys(True))
+    assert (found == wanted).all() and found.batch_size == wanted.batch_size
+    assert type(found) is type(wanted) and found.names == wanted.names
+    assert found["next"].batch_size == wanted["next"].batch_size
+
+
 def test_prefetched_batches_are_dropped(rb):
     rb.sample()  # samples the next ones ahead
     fence.storage_data(rb.storage)["a"].fill_(9)

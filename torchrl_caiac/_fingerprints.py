@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import torch
@@ -123,7 +123,7 @@ def matches(
     keys: Sequence[NestedKey],
     next_keys: Sequence[NestedKey],
     names: Sequence[str],
-    read: Callable[[torch.Tensor], torch.Tensor] | None = None,
+    rows: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Returns which rows still have the states of their fingerprints.
 
@@ -133,16 +133,16 @@ def matches(
         keys (sequence of NestedKey): the entries of states.
         next_keys (sequence of NestedKey): the entries of next states.
         names (sequence of str): the entities, in the order of the scores.
-        read (callable, optional): returns ``B`` rows of a leaf, those to compare.
-            Defaults to all of them.
+        rows (torch.Tensor, optional): int64 ``[B]``, the rows to compare. Defaults to
+            all of them.
 
     Returns:
         torch.Tensor: bool ``[B]``.
     """
-    left = known if read is None else read(known)
+    left = known if rows is None else known.index_select(0, rows)
     for entries, factor in ((keys, 1), (next_keys, _NEXT)):
         for number, leaf in enumerate(state_leaves(td, entries)):
-            leaf = leaf if read is None else read(leaf)
+            leaf = leaf if rows is None else leaf.index_select(0, rows)
             left = left - _weighted(_lanes(leaf), number, factor)
     return left >> 32 == _upper_half(tuple(names))
 

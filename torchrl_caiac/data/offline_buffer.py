@@ -4,13 +4,65 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 
+from torchrl_caiac._torchrl import (
+    lazy_rows,
+    rows_of,
+    sampling_buffer,
+    storage_data,
+)
 from torchrl_caiac.data.add_leaf import store_leaves
 
-__all__ = ["offline_buffer", "offline_storage"]
+__all__ = ["OfflineStorage", "offline_buffer", "offline_storage"]
+
+
+class OfflineStorage(TensorStorage):
+    """A storage that copies whole rows, which takes half of the time on a CPU.
+
+    It returns what a :class:`~torchrl.data.TensorStorage` returns.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.data.offline_buffer import OfflineStorage
+        >>> storage = OfflineStorage(TensorDict({"a": torch.arange(10)}, [10]))
+        >>> storage.get(torch.tensor([7, 7, 2]))["a"]
+        tensor([7, 7, 2])
+    """
+
+    def get(self, index: Any) -> Any:
+        """Returns rows, see :class:`~torchrl.data.TensorStorage`."""
+        rows = self._rows(index)
+        if rows is not None:
+            try:
+                return rows_of(storage_data(self), rows)
+            except IndexError:  # negative, or too large
+                pass
+        return super().get(index)
+
+    def __getitem__(self, index: Any) -> Any:
+        # Samplers of slices look for flags of the rows that they drew.
+        rows = self._rows(index) if isinstance(index, tuple) else None
+        if rows is not None and sampling_buffer() is not None:
+            return lazy_rows(storage_data(self), rows)
+        return super().__getitem__(index)
+
+    def _rows(self, index: Any) -> torch.Tensor | None:
+        """Returns the rows ``[B]`` of an index on the CPU, ``None`` of another one."""
+        rows = index[0] if isinstance(index, tuple) and len(index) == 1 else index
+        if (
+            isinstance(rows, torch.Tensor)
+            and (rows.ndim, rows.dtype) == (1, torch.int64)
+            and {rows.device.type, torch.device(self.device).type} == {"cpu"}
+            and self.ndim == 1
+            and len(self) == len(storage_data(self))
+        ):
+            return rows
+        return None
 
 
 def offline_buffer(
@@ -61,14 +113,14 @@ def offline_buffer(
     return TensorDictReplayBuffer(**arguments)
 
 
-def offline_storage(data: TensorDictBase) -> TensorStorage:
+def offline_storage(data: TensorDictBase) -> OfflineStorage:
     """Creates the storage of :func:`offline_buffer`, without copying the data.
 
     Args:
         data (TensorDictBase): the transitions, ``[T]``.
 
     Returns:
-        TensorStorage: a storage of them.
+        OfflineStorage: a storage of them.
 
     Raises:
         TypeError: ``data`` is not a tensordict.
@@ -91,4 +143,4 @@ def offline_storage(data: TensorDictBase) -> TensorStorage:
     store_leaves(data)
     # Sample on the device of the data, to avoid transfers.
     device = data.device or next(iter(data.values(True, True))).device
-    return TensorStorage(data, device=device)
+    return OfflineStorage(data, device=device)

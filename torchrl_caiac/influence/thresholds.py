@@ -433,7 +433,7 @@ def _usable(
             layout.in_keys,
             [layout.next(entry) for entry in layout.in_keys],
             layout.names,
-            lambda leaf: leaf.index_select(0, rows),
+            rows,
         )
     if not bool(used.any()):
         raise ValueError(

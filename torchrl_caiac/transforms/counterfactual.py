@@ -30,7 +30,7 @@ from torchrl_caiac.transforms.checks import (
     check_number,
     check_window,
 )
-from torchrl_caiac.transforms.donors import BufferDonors, RowsRead
+from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
 from torchrl_caiac.transforms.free_share import FreeShare
 from torchrl_caiac.transforms.goals.window import WindowGoal
@@ -412,10 +412,9 @@ class CounterfactualTransform(RandomTransform, ABC):
         plan: SwapPlan,
         values: Sequence[torch.Tensor],
         draw: SwapDraw,
-        read: RowsRead | None = None,
     ) -> TensorDictBase:
         if self._donors:
-            out = self._donors[0].apply(td, plan, values, draw, read)
+            out = self._donors[0].apply(td, plan, values, draw)
         else:
             out = apply_swap(td, plan, values, draw, window=self.window)
         keys, swapped = self.keys, draw.swapped
@@ -490,10 +489,9 @@ class CounterfactualTransform(RandomTransform, ABC):
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)
         draw = self._draw(scores)
-        read = None
         if self.check and self._donors:
-            draw, read = self._donors[0].verified(draw)
-        out = self._swap(tensordict, plan, values, draw, read)
+            draw = self._donors[0].verified(draw)
+        out = self._swap(tensordict, plan, values, draw)
         if checked is not None:
             self._batch_check.after(out, checked, plan.states)
             if checked.unscored is not None:

@@ -32,7 +32,7 @@ from torchrl_caiac.transforms.thresholds import EntityThresholds
 if TYPE_CHECKING:
     from torchrl_caiac.transforms.goals.window import WindowGoal
 
-__all__ = ["BufferDonors", "RowsRead", "eligible_starts", "scan_donors"]
+__all__ = ["BufferDonors", "eligible_starts", "scan_donors"]
 
 # Rows of the storage that are read together while an index is built.
 _CHUNK = 1 << 17
@@ -150,32 +150,6 @@ def eligible_starts(
                 words[entity].index_add_(0, word, value)
     found = DonorBits.of_words(words)
     return found if int(found.size.sum()) > _MOST_LISTED else found.listed()
-
-
-class RowsRead:
-    """Rows of a storage, of which each leaf is read once.
-
-    Args:
-        rows (torch.Tensor): int64 ``[M]``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.transforms.donors import RowsRead
-        >>> RowsRead(torch.tensor([2, 0]))(torch.tensor([5, 6, 7]))
-        tensor([7, 5])
-    """
-
-    def __init__(self, rows: torch.Tensor) -> None:
-        self.rows = rows
-        self._read: dict[Any, torch.Tensor] = {}
-
-    def __call__(self, leaf: torch.Tensor) -> torch.Tensor:
-        """Returns the rows of a leaf ``[T, ...]``, ``[M, ...]``."""
-        key = leaf.data_ptr(), leaf.dtype, leaf.shape, leaf.stride()
-        found = self._read.get(key)
-        if found is None:
-            found = self._read[key] = leaf.index_select(0, self.rows)
-        return found
 
 
 class BufferDonors:
@@ -339,7 +313,7 @@ class BufferDonors:
         rows = self.goals.draw_rows(last, trajectories, generator=generator)
         return draw._replace(goal_rows=rows)
 
-    def verified(self, draw: SwapDraw) -> tuple[SwapDraw, RowsRead | None]:
+    def verified(self, draw: SwapDraw) -> SwapDraw:
         """Takes back swaps whose donors were written to after they were scored.
 
         The index of donors is built again after each write that the storage notices. It
@@ -351,41 +325,38 @@ class BufferDonors:
             draw (SwapDraw): from :meth:`draw`.
 
         Returns:
-            tuple: the draw, without these swaps, which count as having no donor; and
-            what was read of the donors, if :meth:`apply` can use it.
+            SwapDraw: the draw, without these swaps, which count as having no donor.
         """
         _, trajectories, data = self.index()
         known = data.get(fingerprint_key(self.score_key), None)
         if known is None or {known.device.type, draw.swapped.device.type} != {"cpu"}:
-            return draw, None
-        rows = draw.donors[draw.swapped]
+            return draw
+        rows = draw.donors.masked_select(draw.swapped)
         if not len(rows):
-            return draw, None
+            return draw
         every = rows
         if self.window > 1 and trajectories is not None:
             every = torch.cat([rows, trajectories.later(rows, self.window - 1)])
         layout = self.layout
-        read = RowsRead(every)
         is_valid = matches(
             data,
             plain_tensor(known),
             layout.in_keys,
             [layout.next(key) for key in layout.in_keys],
             layout.names,
-            read,
+            every,
         )
         if bool(is_valid.all()):
-            return draw, read if self.window == 1 else None
+            return draw
         self.refresh()
         is_valid = is_valid.view(-1, len(rows)).all(0)
         lost = draw.swapped.nonzero()[~is_valid]
         taken_back = torch.zeros_like(draw.swapped)
         taken_back[lost[:, 0], lost[:, 1]] = True
-        draw = draw._replace(
+        return draw._replace(
             swapped=draw.swapped & ~taken_back,
             no_donor=draw.no_donor + taken_back.sum(0),
         )
-        return draw, None
 
     def apply(
         self,
@@ -393,7 +364,6 @@ class BufferDonors:
         plan: SwapPlan,
         values: Sequence[torch.Tensor],
         draw: SwapDraw,
-        read: RowsRead | None = None,
     ) -> TensorDictBase:
         """Applies what :meth:`draw` returned, see :func:`apply_swap`.
 
@@ -402,7 +372,6 @@ class BufferDonors:
             plan (SwapPlan): its plan.
             values (sequence of torch.Tensor): its leaves.
             draw (SwapDraw): the draw.
-            read (RowsRead, optional): what :meth:`verified` read.
 
         Returns:
             TensorDictBase: a shallow copy with new leaves.
@@ -420,16 +389,6 @@ class BufferDonors:
             return goals.donor_goals(data, draw.goal_rows, leaf.owner, leaf.key)
 
         is_in_order = trajectories is None or trajectories.is_storage_order
-        if read is not None:  # behind the rows of the batch, in the order of the swaps
-            count = len(draw.swapped)
-            place = draw.swapped.flatten().cumsum(0).view(draw.swapped.shape)
-            draw = draw._replace(donors=place + (count - 1))
-            sources = [
-                source
-                if goals is not None and leaf.is_desired
-                else torch.cat([values[leaf.place][-count:], read(source)])
-                for leaf, source in zip(plan.leaves, sources, strict=True)
-            ]
         return apply_swap(
             td,
             plan,
@@ -437,8 +396,7 @@ class BufferDonors:
             draw,
             window=self.window,
             sources=sources,
-            has_own=read is not None,
-            trajectories=None if is_in_order or read is not None else trajectories,
+            trajectories=None if is_in_order else trajectories,
             goals=None if goals is None else donor_goals,
         )
 

@@ -305,7 +305,6 @@ def apply_swap(
     *,
     window: int = 1,
     sources: Sequence[torch.Tensor] | None = None,
-    has_own: bool = False,
     trajectories: TrajectoryIndex | None = None,
     goals: Callable[[SwapLeaf], torch.Tensor] | None = None,
 ) -> TensorDictBase:
@@ -324,8 +323,6 @@ def apply_swap(
         window (int): rows in a window. Defaults to 1.
         sources (sequence of torch.Tensor, optional): for each leaf of the plan what
             ``draw.donors`` are rows of, ``[T, ...]``; by default the batch itself.
-        has_own (bool): whether ``sources`` begin with the last ``C`` windows of the
-            batch. Defaults to ``False``.
         trajectories (TrajectoryIndex, optional): which row follows which in
             ``sources``; by default the next one.
         goals (callable, optional): reads the desired goals ``[C, ...]`` of a leaf from
@@ -360,21 +357,28 @@ def apply_swap(
     if not changed:
         return td.copy()
     first = td.shape[0] - changed * window
+    device, donors = draw.swapped.device, draw.donors
+    own = window_starts(changed, window, device).unsqueeze(-1)
+    read = None  # the rows of the donors, if each of them is read once
     if sources is None:
-        starts = window_starts(len(td) // window, window, draw.swapped.device)
-        own = (starts[-changed:] if first else starts).unsqueeze(-1)
-    elif has_own:
-        own = window_starts(changed, window, draw.swapped.device).unsqueeze(-1)
+        own = own + first if first else own
+    elif window == 1 and {x.device.type for x in (draw.swapped, *sources)} == {"cpu"}:
+        # Behind the last rows of the batch.
+        read = donors.masked_select(draw.swapped)
+        donors = draw.swapped.flatten().cumsum(0).view_as(donors) + (changed - 1)
     else:
-        own = draw.donors.new_zeros(changed, 1)
+        own = torch.zeros_like(own)
+    has_own = sources is None or read is not None
     # Where nothing is swapped, a row of the batch is its own donor.
-    rows = torch.where(draw.swapped, draw.donors, own)
+    rows = torch.where(draw.swapped, donors, own)
     if plan.has_rest:  # one more entity, which is never swapped
         rows = torch.cat([rows, own], -1)
-    if trajectories is not None:
-        steps = torch.arange(window, device=rows.device).view(-1, 1)
+    if trajectories is not None and window > 1:
+        steps = torch.arange(window, device=device).view(-1, 1)
         rows = trajectories.later(rows.unsqueeze(1), steps)
-    length = td.shape[0] if sources is None else max(map(len, sources), default=0)
+    length = td.shape[0] + rows.numel()
+    if not has_own:
+        length = max(map(len, sources or ()), default=0)
     if length * max((leaf.width for leaf in plan.leaves), default=0) < 1 << 31:
         rows = rows.int()  # half as much to write and to read
     places: dict[int, torch.Tensor] = {}
@@ -382,11 +386,14 @@ def apply_swap(
     leaves: dict[NestedKey, torch.Tensor] = {}
     for number, leaf in enumerate(plan.leaves):
         value = values[leaf.place]
-        is_complete = sources is None or has_own
+        is_complete = has_own
         if goals is not None and leaf.is_desired:
             new, is_complete = goals(leaf).unsqueeze(1), False
         else:
             source = value if sources is None else sources[number]
+            if read is not None:
+                own_rows = value[first:] if first else value
+                source = torch.cat([own_rows, source.index_select(0, read)])
             if leaf.group not in places:
                 found = _places(rows, leaf, window)
                 places[leaf.group] = found.to(source.device)
