@@ -445,7 +445,7 @@ def _column_groups(
     if left_out:
         notes.append(
             f"columns {column_spans(left_out)} never move, or far less than the "
-            "others, and are left out: find out whose they are"
+            "others, and are left out: find out which entity they belong to"
         )
     found = sorted(set(owner) - {-1}, key=owner.index)
     names = iter(f"entity{i}" for i in range(len(found)))

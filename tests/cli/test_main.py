@@ -98,7 +98,7 @@ def test_interrupting(
     monkeypatch.setattr("torchrl_caiac.cli.inspect.inspect_dataset", interrupted)
     result = caiac("inspect", pushes)
     assert result.code == 130
-    assert result.err.endswith("interrupted: repeat the same call\n")
+    assert result.err.endswith("interrupted: run the same command again to resume\n")
 
 
 def test_what_others_print_is_not_shown(

@@ -67,7 +67,7 @@ def _run(args: object, console: Console) -> int:
         console.error(_dataset_error(error))
     except KeyboardInterrupt:
         console.trace()
-        console.note("interrupted: repeat the same call")
+        console.note("interrupted: run the same command again to resume")
         return INTERRUPTED
     except _EXPECTED as error:
         console.trace()

@@ -561,8 +561,8 @@ class CounterfactualTransform(RandomTransform, ABC):
                 where = "on each buffer of the ensemble"
             raise KeyError(
                 f"the batch has no {donors.scores_name} in {self.score_key!r}: call "
-                f"score_buffer {where}, open data again that were scored since, or "
-                f"name their key with {donors.key_argument}"
+                f"score_buffer {where}, or open the data again if they were "
+                f"scored since; another key is given by {donors.key_argument}"
             )
         expected = (td.shape[0], *self.feature_shape)
         if tuple(scores.shape) != expected:
