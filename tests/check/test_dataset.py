@@ -467,7 +467,8 @@ def test_planted_errors_are_found_alone(name: str) -> None:
     if name == "constant":
         columns = {**ENTITIES, "left": [*ENTITIES["left"], 10]}
         layout = EntityLayout(columns, fixed=["robot"])
-        data = data.exclude("achieved_goal", ("next", "achieved_goal"))
+        goals = ("desired_goal", "achieved_goal", ("next", "achieved_goal"))
+        data = data.exclude(*goals)
     torch.manual_seed(0)
     report = check_dataset(data, layout, action_spec=(-1, 1))
     assert [(f.code, f.severity) for f in report.findings] == [(code, severity)]
@@ -478,6 +479,13 @@ def test_columns_that_mix_entities() -> None:
     data = clean()
     own_relative(data)
     assert codes(data) == ["always_moves", "mixed_columns"]
+
+
+def test_goals_that_the_layout_does_not_name_are_found() -> None:
+    data = clean()
+    layout = EntityLayout(ENTITIES, fixed=["robot"])
+    assert codes(data, layout)[:1] == ["goals_not_mapped"]
+    assert codes(data.exclude("desired_goal"), layout).count("goals_not_mapped") == 0
 
 
 # --- other sources, layouts and options ----------------------------------------------
@@ -671,7 +679,8 @@ def test_fitting_stops_before_it_learns_from_errors(name: str) -> None:
 def test_warnings_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     columns = {"robot": range(4), "left": range(4, 7), "right": range(7, 9)}
     layout = EntityLayout(columns, fixed=["robot", "right"])
-    data = clean().exclude("achieved_goal", ("next", "achieved_goal"))
+    goals = ("desired_goal", "achieved_goal", ("next", "achieved_goal"))
+    data = clean().exclude(*goals)
     widen(data, relative)
     with caplog.at_level(logging.WARNING, "torchrl_caiac.check"):
         check_before_use(data, layout)

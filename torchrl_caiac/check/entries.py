@@ -91,6 +91,9 @@ def check_entries(
         findings += _check_tensor(data, action_key, "the action")
     if layout.goal:
         findings += _check_goals(data, layout, reward_key)
+    elif data.get(key := layout.desired_goal_key or "desired_goal", None) is not None:
+        message = f"the transitions have {key!r}, but the layout names no goals"
+        findings.append(finding("goals_not_mapped", message, key=key))
     return findings
 
 

@@ -35,6 +35,13 @@ KINDS: dict[str, Kind] = {
         "a learner that reads rewards fails, and none can be recomputed after a swap",
         "add the rewards, unless the learner reads none",
     ),
+    "goals_not_mapped": Kind(
+        "warning",
+        "goals do not follow a swap, so that the actions of counterfactuals do not lead "
+        "to them",
+        "say which columns of the goals belong to which entity, by goal= and achieved= "
+        "of the layout, unless the learner reads no goals",
+    ),
     "wrong_shape": Kind(
         "error",
         "a later step fails, or reads the wrong numbers",

@@ -71,7 +71,7 @@ def load_array_file(
     Keyword Args:
         infos (sequence of str): other arrays to keep under ``"info"``, such as
             ``"infos/qpos"``. Defaults to ``()``: the others are left out, which a
-            message in the log says.
+            message in the log says, a warning if names have no ``/``.
         exclude (sequence of str): arrays to leave out. Defaults to ``()``.
         action_bounds (tuple of sequences, optional): see
             :func:`~torchrl_caiac.data.action_bounds`. Defaults to ``None``: unknown.
@@ -131,8 +131,16 @@ def load_array_file(
             )
         left_out = sorted({*arrays} - {*used, *infos, *exclude})
         if left_out:
-            _logger.info(
-                "%s of %s are left out; pass infos= to keep some", left_out, file
+            # Names with a folder, such as D4RL's infos/qpos, are usual; others may be
+            # misspelt.
+            level = logging.INFO if all("/" in x for x in left_out) else logging.WARNING
+            _logger.log(
+                level,
+                "%s of %s are left out: rename them if they are one of %s, or keep some "
+                "by infos=",
+                left_out,
+                file,
+                sorted(_ARGUMENTS),
             )
         kept = {argument: arrays[name] for name, argument in used.items()}
         try:
