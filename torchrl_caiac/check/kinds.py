@@ -37,8 +37,8 @@ KINDS: dict[str, Kind] = {
     ),
     "goals_not_mapped": Kind(
         "warning",
-        "goals do not follow a swap, so that the actions of counterfactuals do not lead "
-        "to them",
+        "goals do not follow a swap, so that the actions of counterfactuals do not "
+        "lead to them",
         "say which columns of the goals belong to which entity, by goal= and achieved= "
         "of the layout, unless the learner reads no goals",
     ),

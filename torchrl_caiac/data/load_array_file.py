@@ -136,8 +136,8 @@ def load_array_file(
             level = logging.INFO if all("/" in x for x in left_out) else logging.WARNING
             _logger.log(
                 level,
-                "%s of %s are left out: rename them if they are one of %s, or keep some "
-                "by infos=",
+                "%s of %s are left out: rename them if they are one of %s, or keep "
+                "some by infos=",
                 left_out,
                 file,
                 sorted(_ARGUMENTS),
