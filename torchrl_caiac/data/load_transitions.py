@@ -88,16 +88,16 @@ def load_transitions(
             f"the folder {path} does not exist: create the data first, for example "
             "with load_minari"
         )
-    for left in reversed(range(_TRIES)):
+    for _ in range(_TRIES):
         before = meta_state(path)
         recover_meta(path)
         try:
             return _open(path, keys, verify)
         except UnreadableFileError:
             # Perhaps it was read while another process added a leaf.
-            if not left or meta_state(path) == before:
+            if meta_state(path) == before:
                 raise
-    raise AssertionError
+    return _open(path, keys, verify)
 
 
 def _open(path: Path, keys: Iterable[NestedKey], verify: bool) -> TensorDict:

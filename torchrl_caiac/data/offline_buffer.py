@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -35,13 +36,21 @@ class OfflineStorage(TensorStorage):
     """
 
     def get(self, index: Any) -> Any:
-        """Returns rows, see :class:`~torchrl.data.TensorStorage`."""
+        """Returns rows, see :class:`~torchrl.data.TensorStorage`.
+
+        Args:
+            index (Any): which rows, as for a tensor.
+
+        Returns:
+            TensorDictBase: the rows, copied if the index is a tensor.
+
+        Raises:
+            IndexError: there are no such rows.
+        """
         rows = self._rows(index)
         if rows is not None:
-            try:
+            with suppress(IndexError):  # negative, or too large
                 return rows_of(storage_data(self), rows)
-            except IndexError:  # negative, or too large
-                pass
         return super().get(index)
 
     def __getitem__(self, index: Any) -> Any:

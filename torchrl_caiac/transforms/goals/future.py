@@ -221,6 +221,9 @@ class FutureGoal(RandomTransform, SampleUnit):
 
         Args:
             otherwise (str): what else could be done. Defaults to nothing.
+
+        Returns:
+            RuntimeError: to be raised; it says what to do.
         """
         name = type(self).__name__
         if isinstance(sampling_buffer(), ReplayBufferEnsemble):
