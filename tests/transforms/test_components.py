@@ -283,3 +283,16 @@ def test_starts_that_cannot_be_found() -> None:
     graphs[2, 1, 0] = torch.inf
     with pytest.raises(ValueError, match="graphs of the donors are infinite in row 2"):
         component_starts(graphs, 0.2, fixed)
+
+
+def test_graphs_that_change_while_they_are_indexed_are_refused(monkeypatch):
+    graphs = torch.zeros(4, 3, 2)
+    scan = module.scan_donors
+
+    def changing(values, *args):
+        yield from scan(values, *args)
+        graphs[1, 0, 1] = 1.0  # one component instead of two
+
+    monkeypatch.setattr(module, "scan_donors", changing)
+    with pytest.raises(RuntimeError, match="written to while they were indexed"):
+        component_starts(graphs, 0.2, torch.tensor([False, False]))

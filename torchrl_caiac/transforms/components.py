@@ -316,6 +316,7 @@ def component_starts(
 
     Raises:
         ValueError: a score is infinite.
+        RuntimeError: the graphs were written to meanwhile.
 
     Examples:
         >>> import torch
@@ -359,7 +360,12 @@ def component_starts(
     starts = torch.empty(int(size.sum()), dtype=dtype, device=device)
     following = offset.clone()
     parts = place.split([len(own) for own, _ in counted])
-    for own, (_, count), (rows, _) in zip(parts, counted, found(), strict=True):
+    for own, (_, count), (rows, now) in zip(parts, counted, found(), strict=True):
+        if not torch.equal(masks[own].repeat_interleave(count), now):
+            raise RuntimeError(
+                "the graphs of the donors were written to while they were indexed: "
+                "sample again when no other process or thread scores the donors"
+            )
         shift = following[own] - (count.cumsum(0) - count)
         here = shift.repeat_interleave(count) + torch.arange(len(rows), device=device)
         starts[here] = rows.to(dtype)
