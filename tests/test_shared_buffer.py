@@ -60,7 +60,7 @@ def make(**kwargs: Any) -> CAIACReplayBuffer:
     settings = {
         "augmentation": partial(CAIACTransform, LAYOUT, 0.5, 0.0),
         "goals": partial(HindsightGoal, LAYOUT, reward, future=1.0),
-        "batch_size": 64,
+        "batch_size": 512,
         **kwargs,
     }
     settings.setdefault("shared", not settings.get("prefetch"))
