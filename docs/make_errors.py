@@ -21,7 +21,10 @@ STEPS = {
     "Scores and thresholds": ("influence", "evaluation", "_fingerprints"),
     "Sampling": ("transforms", "caiac_buffer", "_buffer_transform", "_random"),
     "Training": ("objectives",),
-    "Command line and reports": ("cli", "report", "scored", "inspection", "plotting"),
+    "Command line and reports": (
+        *("cli", "report", "scored", "inspection", "plotting"),
+        *("_layout_proposal", "_moving_groups"),
+    ),
     "Other": (),
 }
 HEAD = """\

@@ -11,8 +11,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from tests.check.pushing import clean
 from tests.pushes import LAYOUT, push_transitions
-from torchrl_caiac import EntityLayout
+from torchrl_caiac import EntityLayout, check_dataset
 from torchrl_caiac.inspection import inspect_dataset
 
 
@@ -263,3 +264,18 @@ def test_without_velocities_positions_are_unknown() -> None:
     found = inspect_dataset(transitions(*world(2, [2, 2], 3)))
     assert not found.proposal.positions
     assert any("positions of robot, entity0" in note for note in found.notes)
+
+
+def test_goals_that_equal_columns_are_mapped() -> None:
+    data = clean()
+    found = inspect_dataset(data)
+    assert found.proposal is not None
+    columns = found.proposal.columns
+    goals = {name: list(own) for name, own in found.proposal.goal.items()}
+    assert [columns[name] for name in goals] == [(4, 5), (7, 8)]
+    assert list(goals.values()) == [[0, 1], [2, 3]]
+    assert check_dataset(data, found.proposal).ok
+    data["achieved_goal"] = data["achieved_goal"] + 0.01
+    other = inspect_dataset(data)
+    assert other.proposal is not None and not other.proposal.goal
+    assert any("name goal and achieved" in note for note in other.notes)

@@ -32,10 +32,12 @@ LAYERS = [
     {
         "_layout_files",
         "_layout_format",
+        "_layout_proposal",
         "_layout_reading",
         "_layout_short",
         "_layout_units",
         "_layout_yaml",
+        "_moving_groups",
         "entities",
         "trajectories",
         "trajectory_cache",

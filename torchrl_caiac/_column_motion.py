@@ -4,9 +4,37 @@ from __future__ import annotations
 
 import torch
 
-__all__ = ["explained_shares", "motion_correlations", "position_columns"]
+__all__ = [
+    "explained_shares",
+    "motion_correlations",
+    "moving_columns",
+    "position_columns",
+]
 
 _VELOCITY = 0.9  # correlation of a position's change with its velocity
+_MOVES = 1e-3  # of a column's range: a change above it counts as motion
+_JITTER = 5e-3  # of the median range: a column with a smaller one does not move
+
+
+def moving_columns(now: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+    """Returns where columns change by more than a thousandth of their range.
+
+    Args:
+        now (torch.Tensor): the columns, ``[T, D]``.
+        change (torch.Tensor): their changes, finite ``[T, D]``.
+
+    Returns:
+        torch.Tensor: bool ``[T, D]``. A column whose range is far smaller than that of
+        the others does not move.
+    """
+    known = now.isfinite()
+    low = torch.where(known, now, torch.inf).amin(0)
+    high = torch.where(known, now, -torch.inf).amax(0)
+    span = torch.nan_to_num(high - low, 0.0, 0.0, 0.0)
+    positive = span[span > 0]
+    # What is far smaller than everything else is jitter, not motion.
+    usual = positive.median() if len(positive) else span.new_zeros(())
+    return (change.abs() > _MOVES * span) & (span > _JITTER * usual)
 
 
 def explained_shares(change: torch.Tensor, action: torch.Tensor) -> torch.Tensor:

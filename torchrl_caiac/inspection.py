@@ -12,15 +12,19 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._checks import check_int
-from torchrl_caiac._column_motion import (
-    explained_shares,
-    motion_correlations,
-    position_columns,
-)
 from torchrl_caiac._columns import column_spans
 from torchrl_caiac._files import plain
 from torchrl_caiac._keys import as_key, floating, get_leaf, join, jsonable, missing_key
 from torchrl_caiac._keys import path as path_of
+from torchrl_caiac._layout_proposal import propose_layout
+from torchrl_caiac._moving_groups import (
+    DATA_LACK,
+    ColumnFacts,
+    MovingColumns,
+    MovingGroup,
+    column_groups,
+    leaf_groups,
+)
 from torchrl_caiac.data import action_bounds
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import trajectory_index
@@ -30,14 +34,7 @@ __all__ = ["ColumnFacts", "Inspection", "LeafFacts", "MovingGroup", "inspect_dat
 _CHUNK = 1 << 22  # numbers read at a time
 _MOST_NUMBERS = 20_000_000  # of the states in which columns are looked at
 _MOST_COLUMNS = 1024  # a wider leaf is an image
-_MOVES = 1e-3  # of a column's range: a change above it counts as motion
-_JITTER = 5e-3  # of the median range: a column with a smaller one does not move
-_ALWAYS = 0.5  # share of rows in which a column of the robot moves
-_EXPLAINED = 0.6  # share of a change's variance that the action explains, in the robot
-_TOGETHER = 0.5  # correlation of columns of one entity, next to each other
-_APART = 0.7  # the same, of columns that are not next to each other
 _TENTHS = 10
-_LACK = "the data lack"
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
@@ -65,65 +62,6 @@ class LeafFacts:
     low: float | None
     high: float | None
     not_finite: int
-
-
-@dataclass(frozen=True)
-class ColumnFacts:
-    """One column of the observation, in the rows that were looked at.
-
-    Args:
-        column (int): its number; in a nested observation, its place in the leaf.
-        low (float, optional): the lowest value; ``None`` if none is finite.
-        high (float, optional): the highest value.
-        moves (float): the share of rows in which it moves: changes by more than a
-            thousandth of its range.
-        step (float): the median size of a change when it moves, in the data's units.
-        explained (float): the share of its changes' variance that a linear function of
-            the action explains, in [0, 1].
-        key (NestedKey): the leaf. Defaults to ``"observation"``.
-
-    Examples:
-        >>> from torchrl_caiac.inspection import ColumnFacts
-        >>> ColumnFacts(3, 0.0, 1.0, 0.25, 0.01, 0.0).moves
-        0.25
-    """
-
-    column: int
-    low: float | None
-    high: float | None
-    moves: float
-    step: float
-    explained: float
-    key: NestedKey = "observation"
-
-
-@dataclass(frozen=True)
-class MovingGroup:
-    """Columns that move together, which may be an entity.
-
-    Args:
-        name (str): its name in the proposed layout.
-        columns (tuple of int): its columns; in a nested observation, all of its leaf.
-        moves (float): the share of rows in which at least one of them moves.
-        when (tuple of float): the same, in each tenth of an episode, ``[10]``.
-        is_robot (bool): whether it moves almost always, or with the action.
-        key (NestedKey): the leaf. Defaults to ``"observation"``.
-        positions (tuple of int): those of its columns of which another one is the
-            velocity. Defaults to ``()``: none is known.
-
-    Examples:
-        >>> from torchrl_caiac.inspection import MovingGroup
-        >>> MovingGroup("robot", (0, 1), 1.0, (1.0,) * 10, True).columns
-        (0, 1)
-    """
-
-    name: str
-    columns: tuple[int, ...]
-    moves: float
-    when: tuple[float, ...]
-    is_robot: bool
-    key: NestedKey = "observation"
-    positions: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -241,7 +179,8 @@ def inspect_dataset(
     if they move at the same time almost without exception. Those that move almost
     always, or whose changes the action explains, are the robot's. In a nested
     observation, each leaf is a group. A column is a position if another column of its
-    group is its velocity: has a correlation above 0.9 with its change.
+    group is its velocity: has a correlation above 0.9 with its change. Goals are mapped
+    if each column of ``"achieved_goal"`` equals one column of a flat observation.
 
     The proposal is where to start: look at it, name its entities, and check it with
     :func:`~torchrl_caiac.check_dataset`.
@@ -299,7 +238,7 @@ def inspect_dataset(
     observation_key = as_key(observation_key)
     observation = data.get(observation_key, None)
     if observation is None:
-        raise missing_key(data, observation_key, _LACK, "pass observation_key")
+        raise missing_key(data, observation_key, DATA_LACK, "pass observation_key")
     is_nested = not isinstance(observation, torch.Tensor)
     notes: list[str] = []
     keys = _vectors(data, observation_key, notes)
@@ -308,13 +247,15 @@ def inspect_dataset(
     rows = torch.arange(0, len(data), math.ceil(len(data) / most))
     length = index.lengths[torch.searchsorted(index.ends, index.position(rows))]
     tenth = (length - 1 - index.remaining(rows)) * _TENTHS // length
-    action = get_leaf(data, as_key(action_key), _LACK, "pass action_key")[rows]
+    action = get_leaf(data, as_key(action_key), DATA_LACK, "pass action_key")[rows]
     action = floating(action.flatten(1).as_subclass(torch.Tensor)).double()
-    parts = [_Columns(data, key, join(next_key, key), rows, action) for key in keys]
+    parts = [
+        MovingColumns(data, key, join(next_key, key), rows, action) for key in keys
+    ]
     if is_nested:
-        groups = _leaf_groups(parts, tenth)
+        groups = leaf_groups(parts, tenth)
     else:
-        groups = _column_groups(parts[0], tenth, notes) if parts else []
+        groups = column_groups(parts[0], tenth, notes) if parts else []
     bounds = action_bounds(data)
     if bounds is None:
         notes.append(
@@ -329,7 +270,7 @@ def inspect_dataset(
         columns=tuple(fact for part in parts for fact in part.facts()),
         groups=tuple(groups),
         bounds=None if bounds is None else (bounds[0].tolist(), bounds[1].tolist()),
-        proposal=_proposal(groups, observation_key, next_key, is_nested, notes),
+        proposal=propose_layout(data, rows, groups, observation_key, next_key, notes),
         notes=tuple(notes),
         layouts=tuple(layouts),
     )
@@ -350,211 +291,6 @@ def _vectors(
             "looked at: entities are parts of vectors"
         )
     return [key for key in keys if 0 < data.get(key)[0].numel() <= _MOST_COLUMNS]
-
-
-class _Columns:
-    """How the columns of one leaf change."""
-
-    def __init__(
-        self,
-        data: TensorDictBase,
-        key: NestedKey,
-        next_key: NestedKey,
-        rows: torch.Tensor,
-        action: torch.Tensor,
-    ) -> None:
-        self.key = key
-        now = self._read(data, key, rows)
-        change = self._read(data, next_key, rows) - now
-        change = torch.nan_to_num(change, 0.0, 0.0, 0.0)
-        known = now.isfinite()
-        self.low = torch.where(known, now, math.inf).amin(0)
-        self.high = torch.where(known, now, -math.inf).amax(0)
-        span = torch.nan_to_num(self.high - self.low, 0.0, 0.0, 0.0)
-        size = change.abs()
-        # What is far smaller than everything else is jitter, not motion.
-        usual = (
-            span[span > 0].median() if bool((span > 0).any()) else span.new_zeros(())
-        )
-        self.moving = (size > _MOVES * span) & (span > _JITTER * usual)
-        self.moves = self.moving.double().mean(0)
-        large = torch.where(self.moving, size, torch.nan)
-        self.step = large.nanmedian(0).values.nan_to_num(0.0)
-        self.explained = explained_shares(change, action)
-        self.positions = position_columns(now, change)
-
-    @staticmethod
-    def _read(data: TensorDictBase, key: NestedKey, rows: torch.Tensor) -> torch.Tensor:
-        leaf = get_leaf(data, key, _LACK, "add it")[rows].as_subclass(torch.Tensor)
-        return floating(leaf.flatten(1)).double()
-
-    @property
-    def is_robot(self) -> torch.Tensor:
-        """Which columns move almost always, or with the action, bool ``[D]``."""
-        often = (self.moves >= _ALWAYS) | (self.explained >= _EXPLAINED)
-        return often & self.moving.any(0)
-
-    def facts(self) -> list[ColumnFacts]:
-        """Returns the facts of all columns."""
-        table = zip(
-            [low if math.isfinite(low) else None for low in self.low.tolist()],
-            [high if math.isfinite(high) else None for high in self.high.tolist()],
-            self.moves.tolist(),
-            self.step.tolist(),
-            self.explained.tolist(),
-            strict=True,
-        )
-        return [ColumnFacts(i, *row, key=self.key) for i, row in enumerate(table)]
-
-
-def _column_groups(
-    part: _Columns, tenth: torch.Tensor, notes: list[str]
-) -> list[MovingGroup]:
-    """Groups the columns of a flat observation."""
-    together = motion_correlations(part.moving)
-    robot = part.is_robot
-    still = ~part.moving.any(0)
-    owner: list[int] = []  # of each column; 0: the robot, -1: nobody yet
-    count, last = 0, -1
-    for column in range(len(robot)):
-        if bool(still[column]):
-            owner.append(-1)
-            continue
-        if bool(robot[column]):
-            owner.append(0)
-        elif (
-            last > 0
-            and together[
-                column, [c for c, mine in enumerate(owner) if mine == last]
-            ].amax()
-            >= _TOGETHER
-        ):
-            owner.append(last)
-        else:
-            count += 1
-            owner.append(count)
-        last = owner[-1]
-    owner = _merged(_inside_robot(owner), together)
-    unmoved = tuple(c for c, mine in enumerate(owner) if mine < 0)
-    for column in unmoved:  # inside of a group, it belongs to the group
-        before = [mine for mine in owner[:column] if mine >= 0][-1:]
-        after = [mine for mine in owner[column:] if mine >= 0][:1]
-        if before == after and before:
-            owner[column] = before[0]
-    left_out = tuple(c for c in unmoved if owner[c] < 0)
-    if left_out:
-        notes.append(
-            f"columns {column_spans(left_out)} never move, or far less than the "
-            "others, and are left out: find out which entity they belong to"
-        )
-    found = sorted(set(owner) - {-1}, key=owner.index)
-    names = iter(f"entity{i}" for i in range(len(found)))
-    return [
-        _group(
-            part,
-            tuple(c for c, mine in enumerate(owner) if mine == number),
-            "robot" if number == 0 else next(names),
-            tenth,
-            is_robot=number == 0,
-        )
-        for number in found
-    ]
-
-
-def _inside_robot(owner: list[int]) -> list[int]:
-    """Gives single columns between columns of the robot to it: a joint that waits."""
-    owner = list(owner)
-    for column in range(1, len(owner) - 1):
-        is_alone = owner.count(owner[column]) == 1
-        if is_alone and owner[column - 1] == owner[column + 1] == 0:
-            owner[column] = 0
-    return owner
-
-
-def _merged(owner: list[int], together: torch.Tensor) -> list[int]:
-    """Joins groups that move at the same time, such as positions and velocities."""
-    numbers = sorted(set(owner) - {-1, 0})
-    owner = list(owner)
-    for i, first in enumerate(numbers):
-        for second in numbers[i + 1 :]:
-            mine = [c for c, x in enumerate(owner) if x == first]
-            other = [c for c, x in enumerate(owner) if x == second]
-            if mine and other and together[mine][:, other].amax() >= _APART:
-                owner = [first if x == second else x for x in owner]
-    return owner
-
-
-def _leaf_groups(parts: list[_Columns], tenth: torch.Tensor) -> list[MovingGroup]:
-    """Makes each leaf of a nested observation a group."""
-    return [
-        _group(
-            part,
-            tuple(range(len(part.moves))),
-            "_".join(path_of(part.key)[1:]) or "".join(path_of(part.key)),
-            tenth,
-            is_robot=bool(part.is_robot.any()),
-        )
-        for part in parts
-    ]
-
-
-def _group(
-    part: _Columns,
-    columns: tuple[int, ...],
-    name: str,
-    tenth: torch.Tensor,
-    *,
-    is_robot: bool,
-) -> MovingGroup:
-    moving = part.moving[:, list(columns)].any(1).double()
-    counts = torch.bincount(tenth, minlength=_TENTHS)
-    sums = torch.bincount(tenth, weights=moving, minlength=_TENTHS)
-    when = (sums / counts.clamp(min=1)).tolist()
-    known = part.positions[list(columns)][:, list(columns)].any(1).tolist()
-    return MovingGroup(
-        name,
-        columns,
-        float(moving.mean()),
-        tuple(when),
-        is_robot,
-        part.key,
-        tuple(c for c, is_position in zip(columns, known, strict=True) if is_position),
-    )
-
-
-def _proposal(
-    groups: list[MovingGroup],
-    observation_key: NestedKey,
-    next_key: NestedKey,
-    is_nested: bool,
-    notes: list[str],
-) -> EntityLayout | None:
-    fixed = [group.name for group in groups if group.is_robot]
-    if len(fixed) == len(groups):
-        why = "everything moves almost always, or with the action"
-        notes.append(f"no layout is proposed: {why if groups else 'nothing moves'}")
-        return None
-    if not fixed:
-        notes.append("no robot was found: name it in the layout, as fixed")
-    positions = {group.name: group.positions for group in groups if group.positions}
-    unknown = [group.name for group in groups if not group.positions]
-    if unknown:
-        notes.append(
-            f"the positions of {', '.join(unknown)} are unknown, as no column is the "
-            "velocity of another: name them in the layout, as positions"
-        )
-    if is_nested:
-        keys = {group.name: group.key for group in groups}
-        return EntityLayout.from_keys(
-            keys, fixed=fixed, next_key=next_key, positions=positions
-        )
-    return EntityLayout(
-        {group.name: group.columns for group in groups},
-        observation_key=observation_key,
-        fixed=fixed,
-        next_key=next_key,
-        positions=positions,
-    )
 
 
 def _leaf_facts(data: TensorDictBase) -> list[LeafFacts]:

@@ -484,8 +484,18 @@ def test_columns_that_mix_entities() -> None:
 def test_goals_that_the_layout_does_not_name_are_found() -> None:
     data = clean()
     layout = EntityLayout(ENTITIES, fixed=["robot"])
-    assert codes(data, layout)[:1] == ["goals_not_mapped"]
-    assert codes(data.exclude("desired_goal"), layout).count("goals_not_mapped") == 0
+
+    def severity(*left_out: Any) -> list[str]:
+        report = check_dataset(data.exclude(*left_out), layout)
+        assert {f.code for f in report.findings} <= {"goals_not_mapped"}
+        return [f.severity for f in report.findings]
+
+    # Transforms refuse achieved goals of the state or of the next state.
+    now, later = "achieved_goal", ("next", "achieved_goal")
+    assert severity() == severity(now) == severity(later) == ["error"]
+    assert severity("desired_goal") == ["error"]
+    assert severity(now, later) == ["warning"]
+    assert severity(now, later, "desired_goal") == []
 
 
 # --- other sources, layouts and options ----------------------------------------------

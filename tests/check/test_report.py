@@ -33,7 +33,7 @@ def test_text() -> None:
     lines = str(REPORT).splitlines()
     assert all(len(line) <= 80 for line in lines)
     assert lines[:2] == [
-        "checked 20000 of 1000000 transitions, 5000 trajectories: 1 errors, 1 warnings",
+        "checked 20000 of 1000000 transitions, 5000 trajectories: 1 error, 1 warning",
         "error    not_finite",
     ]
     assert lines[2].startswith("         ('next', 'observation') is nan in row 3, cup,")

@@ -11,8 +11,9 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import path
-from torchrl_caiac.check.entries import goal_entries, state_leaves
+from torchrl_caiac.check.entries import state_leaves
 from torchrl_caiac.check.kinds import finding
+from torchrl_caiac.check.regression import Regression
 from torchrl_caiac.check.report import Finding
 from torchrl_caiac.check.sample import Sample
 from torchrl_caiac.check.state import States
@@ -22,10 +23,6 @@ from torchrl_caiac.entities import EntityLayout
 __all__ = ["Unowned", "check_columns", "check_goals", "unowned_columns"]
 
 _MAX_COLUMNS = 512  # wider entries, such as images, are left out
-_ROWS = 20_000  # rows of the regression
-_EXPLAINED = 0.999  # of the variance, in trajectories that were held out
-_LONG = 1_000  # rows from which the halves of a single trajectory do
-_RIDGE = 1e-10
 _BOOKKEEPING = {"action", "reward", "done", "terminated", "truncated", "step_count"}
 
 
@@ -72,7 +69,8 @@ def unowned_columns(
         if 0 < len(columns) <= _MAX_COLUMNS:
             labels = tuple(f"{key!r} (column {c})" for c in columns)
             yield Unowned(key, labels, sample.read(key, columns))
-    mapped = {path(key) for key in goal_entries(layout)}
+    goals = [layout.desired_goal_key, layout.achieved_goal_key]
+    mapped = {path(key) for key in goals if key is not None}
     mapped |= {path(key) for key in left_out if key is not None}
     for key in data.keys(include_nested=True, leaves_only=True):
         parts = path(key)
@@ -94,6 +92,7 @@ def check_columns(
     layout: EntityLayout,
     sample: Sample,
     states: States,
+    regression: Regression | None,
     unowned: Iterator[Unowned],
     still: Collection[str],
 ) -> list[Finding]:
@@ -103,6 +102,8 @@ def check_columns(
         layout (EntityLayout): the entities.
         sample (Sample): the rows.
         states (States): their states.
+        regression (Regression, optional): the linear functions between them. ``None``
+            if there are too few rows.
         unowned (iterator of Unowned): the columns that no entity owns.
         still (collection of str): names of columns of entities that never move.
 
@@ -112,7 +113,7 @@ def check_columns(
     if len(sample) < 2:
         return []
     findings = []
-    owner = _owners(states)
+    owner = states.owners
     constant = (states.now == states.now[:1]).all(0)
     columns = [
         label
@@ -131,7 +132,6 @@ def check_columns(
         )
         columns = sorted({label for pair in copies for label in pair})
         findings.append(finding("duplicate_columns", message, columns=columns))
-    regression = _Regression.of(sample, states, layout)
     if regression is None:
         return findings
     copied = {label for pair in copies for label in pair}
@@ -207,12 +207,6 @@ def check_goals(
     return findings
 
 
-def _owners(states: States) -> list[str]:
-    return [
-        n for n, where in states.slices.items() for _ in range(where.start, where.stop)
-    ]
-
-
 def _copies(
     states: States, owner: list[str], constant: torch.Tensor, layout: EntityLayout
 ) -> list[tuple[str, str]]:
@@ -229,89 +223,3 @@ def _copies(
             if apart and swapped and torch.equal(states.now[:, a], states.now[:, b]):
                 pairs.append((states.labels[a], states.labels[b]))
     return pairs
-
-
-class _Regression:
-    """Linear functions of owned columns, judged on trajectories that are held out.
-
-    A column that is constant in each trajectory is a linear function of any others, if
-    there are few trajectories. Only held-out trajectories tell.
-    """
-
-    def __init__(
-        self,
-        x: torch.Tensor,
-        chosen: torch.Tensor,
-        half: torch.Tensor,
-        is_fixed: list[bool],
-    ) -> None:
-        self.chosen, self.half = chosen, half
-        self.x = x
-        self.gram = x[half].T @ x[half]
-        self.is_fixed = torch.tensor(is_fixed)
-        # Columns that are functions of the others, at least in the rows of the fit.
-        inverse = torch.linalg.inv(
-            self.gram + _RIDGE * len(x) * torch.eye(len(self.gram)).double()
-        )
-        inflation = self.gram.diagonal() * inverse.diagonal()
-        self.is_candidate = (1 - 1 / inflation > _EXPLAINED).tolist()
-
-    @classmethod
-    def of(
-        cls, sample: Sample, states: States, layout: EntityLayout
-    ) -> _Regression | None:
-        """Returns the regression, ``None`` if there are too few rows."""
-        width = states.now.shape[1]
-        if width > _MAX_COLUMNS or len(sample) < 4 * width + 40:
-            return None
-        stride = -(-len(sample) // _ROWS)
-        chosen = torch.arange(0, len(sample), stride)
-        piece = sample.piece[chosen].unique(return_inverse=True)[1]
-        half = piece % 2 == 0
-        if int(piece.max()) < 3:
-            if len(chosen) < _LONG:
-                return None
-            half = torch.arange(len(chosen)) < len(chosen) // 2
-        x = states.now[chosen].double()
-        loc, scale = x[half].mean(0), x.std(0, correction=0)
-        x = (x - loc) / torch.where(scale > 0, scale, 1.0)
-        fixed = [name in layout.fixed for name in _owners(states)]
-        return cls(x, chosen, half, fixed)
-
-    def explained(self, y: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
-        """Returns the explained share of the variance of ``y`` ``[n, U]``, ``[U]``."""
-        y = y.double()
-        y = y - y[self.half].mean(0)
-        total = y[~self.half].square().mean(0)
-        if not bool(columns.any()):
-            return torch.where(total > 0, 0.0, 1.0)
-        x = self.x[:, columns]
-        gram = self.gram[columns][:, columns].clone()
-        gram.diagonal().add_(_RIDGE * len(x))
-        weight = torch.linalg.solve(gram, x[self.half].T @ y[self.half])
-        rest = (y[~self.half] - x[~self.half] @ weight).square().mean(0)
-        return torch.where(total > 0, 1 - rest / total, 0.0)
-
-    def stale(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns which columns ``[n, U]`` follow swapped entities, bool ``[U]``."""
-        y = values[self.chosen]
-        finite = y.isfinite().all(0)
-        y = torch.where(finite, y, 0.0)
-        every = torch.ones_like(self.is_fixed)
-        return (
-            finite
-            & (self.explained(y, every) > _EXPLAINED)
-            & (self.explained(y, self.is_fixed) < _EXPLAINED)
-        )
-
-    def is_mixed(self, column: int, owner: list[str]) -> bool:
-        """Returns whether a column is a function of another entity's columns too."""
-        own = torch.tensor([name == owner[column] for name in owner])
-        others = torch.ones_like(own)
-        own[column] = others[column] = False
-        if not self.is_candidate[column] or bool(own.all()):
-            return False
-        y = self.x[:, column : column + 1]
-        return bool(self.explained(y, others)[0] > _EXPLAINED) and bool(
-            self.explained(y, own)[0] < 0.99
-        )

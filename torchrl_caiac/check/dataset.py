@@ -18,8 +18,10 @@ from torchrl_caiac._torchrl import last_written, storage_rows
 from torchrl_caiac.check.columns import check_columns, check_goals, unowned_columns
 from torchrl_caiac.check.ends import check_end_entries, check_ends, find_ids
 from torchrl_caiac.check.entries import check_entries, goal_entries
+from torchrl_caiac.check.grouping import check_grouping
 from torchrl_caiac.check.kinds import finding
 from torchrl_caiac.check.motion import check_jumps, check_motion
+from torchrl_caiac.check.regression import Regression
 from torchrl_caiac.check.report import DatasetReport, Finding
 from torchrl_caiac.check.sample import Sample, take_sample
 from torchrl_caiac.check.state import States, read_states
@@ -73,8 +75,9 @@ def check_dataset(
     It looks for entries that are missing or have other shapes; next states that are
     not the states of the following rows; ids and end flags that are missing or
     contradict each other; rows in the wrong order; columns that are copies, constant,
-    or functions of swapped columns that the swap does not change; entities that never
-    or always move; jumps; a variance floor in other units; actions that are out of
+    or functions of swapped columns that the swap does not change; columns that move
+    with another entity, or that move and have none; entities that never or always move;
+    jumps; a variance floor in other units; actions that are out of
     bounds or never vary; and values that are not finite. Each finding says what it does
     to counterfactuals, and what to do.
 
@@ -304,15 +307,14 @@ class _Check:
         if not len(sample):
             return
         still: set[str] = set()
-        hidden: set[str] = set()
+        whole: torch.Tensor | None = None
         if states.after is not None:
             links = self._check_succession(sample, states, index)
-            hidden = {found.code for found in links.findings}
             if not bool(padded.any()):  # flags are set before the padding
                 self._check_flags(states, index, links)
-            if not hidden & _MISLEADING:
-                moving = ~links.broken
-                chosen = (sample.keep(moving), states.keep(moving))
+            if not {found.code for found in links.findings} & _MISLEADING:
+                whole = ~links.broken
+                chosen = sample.keep(whole), states.keep(whole)
                 found = check_motion(*chosen, layout.fixed, self.floors)
                 found += check_jumps(*chosen)
                 self.findings += found
@@ -326,8 +328,21 @@ class _Check:
         unowned = unowned_columns(
             layout, data, sample, [*left_out, self.done_key, *self.time_keys]
         )
-        self.findings += check_columns(layout, sample, states, unowned, still)
+        regression = Regression.of(sample, states, layout)
+        self.findings += check_columns(
+            layout, sample, states, regression, unowned, still
+        )
         self.findings += check_goals(layout, sample, data)
+        if whole is not None:
+            known = {
+                column
+                for found in self.findings
+                if found.code in ("duplicate_columns", "stale_columns", "mixed_columns")
+                for column in found.columns
+            }
+            self.findings += check_grouping(
+                layout, sample, states, whole, regression, known
+            )
 
     def _check_goal_values(self, sample: Sample) -> None:
         """Finds goals and rewards that are not finite."""

@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torchrl_caiac._keys import join, leaf_names
 from torchrl_caiac._layout_reading import check_width
 from torchrl_caiac.check.kinds import finding
-from torchrl_caiac.check.report import Finding
+from torchrl_caiac.check.report import Finding, Severity
 from torchrl_caiac.entities import EntityLayout
 
 __all__ = ["check_entries", "goal_entries", "state_leaves"]
@@ -91,10 +91,24 @@ def check_entries(
         findings += _check_tensor(data, action_key, "the action")
     if layout.goal:
         findings += _check_goals(data, layout, reward_key)
-    elif data.get(key := layout.desired_goal_key or "desired_goal", None) is not None:
-        message = f"the transitions have {key!r}, but the layout names no goals"
-        findings.append(finding("goals_not_mapped", message, key=key))
+    else:
+        findings += _check_unmapped(data, layout)
     return findings
+
+
+def _check_unmapped(data: TensorDictBase, layout: EntityLayout) -> list[Finding]:
+    """Finds goals of the transitions that the layout does not name."""
+    achieved = layout.achieved_goal_key or "achieved_goal"
+    desired = layout.desired_goal_key or "desired_goal"
+    keys = [achieved, layout.next(achieved), desired]
+    keys = [key for key in keys if data.get(key, None) is not None]
+    if not keys:
+        return []
+    found = " and ".join(map(repr, keys))
+    message = f"the transitions have {found}, but the layout names no goals"
+    # Transforms refuse batches with achieved goals that they cannot swap.
+    severity: Severity = "warning" if keys == [desired] else "error"
+    return [finding("goals_not_mapped", message, key=keys[0], severity=severity)]
 
 
 def _missing(data: TensorDictBase, key: NestedKey, what: str) -> Finding:

@@ -39,13 +39,13 @@ KINDS: dict[str, Kind] = {
         "warning",
         "goals do not follow a swap, so that the actions of counterfactuals do not "
         "lead to them",
-        "say which columns of the goals belong to which entity, by goal= and achieved= "
-        "of the layout, unless the learner reads no goals",
+        "say which columns of the goals belong to which entity, by goal and achieved "
+        "of the layout; remove goals that the learner does not read",
     ),
     "wrong_shape": Kind(
         "error",
         "a later step fails, or reads the wrong numbers",
-        "correct the entry, or the layout",
+        "compare the entry with the layout",
     ),
     "ids_missing": Kind(
         "error",
@@ -176,6 +176,20 @@ KINDS: dict[str, Kind] = {
         "after a swap these columns describe the place of the donor's other entities",
         "store quantities of one entity alone, and compute relative ones in the "
         "network (GoalFeatures)",
+    ),
+    "moves_with_other": Kind(
+        "warning",
+        "if the columns are the other entity's, a swap takes them apart: states become "
+        "impossible",
+        "compare the layout with the documentation of the data and with what 'caiac "
+        "inspect' proposes: columns may be off by one, or in another order",
+    ),
+    "unowned_columns_move": Kind(
+        "warning",
+        "no swap changes these columns and no world model reads them, so that an "
+        "object among them is left behind",
+        "give them to an entity, a robot's to a fixed one; leave them out of the "
+        "observation if nothing needs them",
     ),
     "goal_not_mirrored": Kind(
         "error",

@@ -176,7 +176,11 @@ class DatasetReport:
     def __str__(self) -> str:
         head = (
             f"checked {self.num_checked} of {self.num_transitions} transitions, "
-            f"{self.num_trajectories} trajectories: {len(self.errors)} errors, "
-            f"{len(self.warnings)} warnings"
+            f"{self.num_trajectories} trajectories: {_counted(self.errors, 'error')}, "
+            f"{_counted(self.warnings, 'warning')}"
         )
         return "\n".join([textwrap.fill(head, _WIDTH), *map(str, self.findings)])
+
+
+def _counted(findings: tuple[Finding, ...], noun: str) -> str:
+    return f"{len(findings)} {noun}{'' if len(findings) == 1 else 's'}"

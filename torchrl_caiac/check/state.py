@@ -41,6 +41,13 @@ class States:
     eps: float
 
     @property
+    def owners(self) -> list[str]:
+        """The entity of each column, ``W`` of them."""
+        return [
+            n for n, own in self.slices.items() for _ in range(own.stop - own.start)
+        ]
+
+    @property
     def tolerance(self) -> torch.Tensor:
         """How far apart two records of the same state may be, ``[W]``."""
         return _RELATIVE * self.scale + self.rounding

@@ -68,8 +68,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     console.text(str(found))
     if found.proposal is not None:
         console.text(
-            "\nproposed layout (rename its entities; say where each of them is, as "
-            "positions, what is noise, as variance_floor, and its goal; check it):"
+            "\nproposed layout (rename its entities; add what the notes name, and what "
+            "is noise, as variance_floor; check it):"
         )
         console.text(_yaml(found.proposal))
         if file is not None:
