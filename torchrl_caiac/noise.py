@@ -261,7 +261,9 @@ def _entity(
     least = torch.maximum(_LEAST * motion, resolution)
     tolerance = torch.maximum(_DEVIATIONS * quiet, least)
     if bool(rests.any()):
-        at_rest = torch.stack([_quantile(c, _LARGE) for c in change[rests].T])
+        # Among few rows, the largest change may be motion that seems to be rest.
+        share = min(_LARGE, 1 - _FEWEST / int(rests.sum()))
+        at_rest = torch.stack([_quantile(c, share) for c in change[rests].T])
         tolerance = torch.maximum(tolerance, at_rest)
     if not reason:
         reason = _reason(rests, noise, moving, floor, resolution, tell)

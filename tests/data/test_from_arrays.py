@@ -488,7 +488,7 @@ class TestEnds:
         ("ends", "match"),
         [
             ({}, r"nothing says where.*episode_lengths=\[10\]"),
-            ({"dones": flags(4, 9)}, "dones do not say.*terminals= or as timeouts="),
+            ({"dones": flags(4, 9)}, "dones do not say.*terminals or as timeouts"),
             ({"terminals": flags(4)}, r"do not cover.*last end is at row 4.*10 rows"),
             ({"terminals": flags()}, "do not cover the data: there is no end"),
             (

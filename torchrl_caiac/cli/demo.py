@@ -31,8 +31,8 @@ def add_parser(commands: Any, **options: Any) -> argparse.ArgumentParser:
         help="run the motivating experiment in the kitchen",
         description="Collects demonstrations in the Franka kitchen, fits a world "
         "model, computes scores, and trains and evaluates policies with and without "
-        "counterfactuals: the same as `make demo`. --quick is a smoke test of the same "
-        "steps, whose numbers mean nothing.",
+        "counterfactuals: the same as `make demo`. It takes about three minutes on two "
+        "cores. --quick is a smoke test of the same steps, whose numbers mean nothing.",
         epilog=_EPILOG,
         **options,
     )

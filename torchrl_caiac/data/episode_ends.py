@@ -97,9 +97,9 @@ def find_episode_ends(
         _check_agree(names[0], first, name, first ^ ends[name])
     if not ends and terminated is None and truncated is None:
         raise ValueError(
-            "nothing says where the episodes end: pass terminals= and timeouts= (with "
-            f"one flag for each of the {steps} actions), episode_lengths= or "
-            f"episode_ids=; episode_lengths=[{steps}] if all rows are one episode"
+            "nothing says where the episodes end: give terminals and timeouts (with "
+            f"one flag for each of the {steps} actions), episode_lengths or "
+            f"episode_ids; episode_lengths=[{steps}] if all rows are one episode"
         )
     found = ends[names[0]] if ends else flagged
     if not found[-1]:
@@ -126,7 +126,7 @@ def _kinds(
     if terminated is None and truncated is None:
         raise ValueError(
             "dones do not say whether the task ended (no value follows) or the time "
-            "did: pass them as terminals= or as timeouts=, or pass one of these, too"
+            "did: give them as terminals or as timeouts, or give one of these, too"
         )
     if terminated is None:
         assert truncated is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -249,6 +250,10 @@ def _by_motion(
     return Split(threshold, "two clear modes", reason, area)
 
 
+def _times(ratio: float) -> str:
+    return f"{ratio:.3g} times" if math.isfinite(ratio) else "far above"
+
+
 def _by_scores(
     scores: NDArray[np.float64], threshold: float, why_unknown: str
 ) -> Split:
@@ -264,7 +269,7 @@ def _by_scores(
     between = near.mean() / share
     modes = (
         f"the scores alone ({why_unknown}) have {100 * share:.3g} % of the rows in the "
-        f"smaller mode, medians in the ratio {contrast:.3g} and "
+        f"smaller mode, whose median is {_times(contrast)} that of the other, and "
         f"{100 * between:.3g} % as many rows between both modes"
     )
     is_clear = (
