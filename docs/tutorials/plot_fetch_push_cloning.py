@@ -132,8 +132,8 @@ for name, share in zip(layout.names[1:], moves.float().mean(0), strict=True):
 # ---------
 # While the gripper flies to a cube, nothing moves yet. If this cube were swapped, the
 # action would go to a place where no cube is any more, and so would a policy that
-# clones it. With ``lookahead="next"`` the transform does not swap the cube either that
-# is influenced *next* in the trajectory. The other one may be swapped.
+# clones it. With ``lookahead="next"`` the transform also keeps the cube that is
+# influenced *next* in the trajectory. The other one may be swapped.
 #
 # To show the difference, we make all rows counterfactual, and sample each row once.
 

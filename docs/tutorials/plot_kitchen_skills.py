@@ -322,6 +322,7 @@ except RenderingUnavailable as error:
 kitchen.close()
 figure
 
-# %% A few episodes of one short training are an illustration, not a measurement: with
+# %%
+# A few episodes of one short training are an illustration, not a measurement: with
 # another seed a task may fail. ``make demo`` has more demonstrations, twice the
 # gradient steps with twice the windows, two seeds, and 20 episodes per task.

@@ -1,6 +1,6 @@
 """
-Online
-======
+Collecting while training
+=========================
 
 A robot that goes on collecting can learn from its own episodes, and swap what it did
 not influence in them. Here, a policy is cloned from 30 demonstrations. Then it plays,

@@ -140,7 +140,7 @@ layout = EntityLayout(
 print(check_dataset(data, layout))
 
 # %%
-# Cloning reads no rewards, so this is what we want.
+# Behaviour cloning needs no rewards, so the missing rewards do not matter.
 #
 # Scores
 # ------

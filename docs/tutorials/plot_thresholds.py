@@ -105,7 +105,7 @@ print(f"largest change of the glued puck: {change[:, 4:6].max():.4f} m")
 # Scores
 # ------
 # Two world models are fitted to the same data, one with this floor, and one with a
-# floor that is far too small. It is here to show what goes wrong,
+# floor that is far too small. The second one shows what goes wrong,
 # and ``check=False`` leaves out the warnings that would say so.
 
 rb = offline_buffer(data, batch_size=256)
