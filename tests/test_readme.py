@@ -330,12 +330,30 @@ def test_comparison_of_estimators(flat_data: TensorDictBase) -> None:
 
 @in_memory
 def test_nested_layout(nested_data: TensorDictBase) -> None:
-    layout = run_how_to("layout = ", EntityLayout=EntityLayout)["layout"]
+    layout = run_how_to("layout = EntityLayout.from_keys(", EntityLayout=EntityLayout)[
+        "layout"
+    ]
     assert layout.names == ("arm", "kettle")
     nested_data["caiac", "score"] = torch.zeros(len(nested_data), 2)
     rb = offline_buffer(nested_data, batch_size=8)
     rb.append_transform(CAIACTransform(layout))
     assert rb.sample()["caiac", "swapped"].any()
+
+
+def test_layout_with_goals() -> None:
+    layout = run_how_to("layout = EntityLayout(", EntityLayout=EntityLayout)["layout"]
+    assert layout.goal_columns() == (2, 3, 4, 5)
+
+
+def test_names_of_the_how_to_page() -> None:
+    scope = run_how_to(
+        "from torchrl_caiac import CAIACTransform\nfrom torchrl_caiac.data"
+    )
+    goal = torch.zeros(2, 3)
+    assert scope["reward"](torch.tensor([[0.0, 0, 0], [1, 0, 0]]), goal).tolist() == [
+        0,
+        -1,
+    ]
 
 
 @in_memory
@@ -349,7 +367,7 @@ def test_rewards_of_transitions(scored: TensorDictBase) -> None:
 @in_memory
 def test_new_estimator(flat_data: TensorDictBase) -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text()
-    (code,) = [b for b in python_blocks(text) if "class MotionInfluence" in b]
+    (code,) = [b for b in python_blocks(text) if "class DisplacementInfluence" in b]
     scope = {
         "EntityLayout": EntityLayout,
         "TensorDictBase": TensorDictBase,
@@ -357,7 +375,9 @@ def test_new_estimator(flat_data: TensorDictBase) -> None:
     }
     exec(compile(code, "CONTRIBUTING.md", "exec"), scope)
     rb = offline_buffer(flat_data, batch_size=8)
-    score_buffer(rb, scope["MotionInfluence"](LAYOUT), lookahead=0, progress=False)
+    score_buffer(
+        rb, scope["DisplacementInfluence"](LAYOUT), lookahead=0, progress=False
+    )
     score = rb.storage[:]["caiac", "score"]
     moved = (flat_data["next", "observation"] - flat_data["observation"]).abs()
     torch.testing.assert_close(score[:, 1], moved[:, 3:6].amax(-1))
