@@ -38,10 +38,10 @@ class BC(GoalConditioned):
         """Makes the buffer of transitions, their goals, and counterfactuals."""
         goals = None
         if not has_own_goals(self.settings):
+            mixture = dict(self.settings.future_goals)
+            offset = {"p": mixture.pop("p")} if "p" in mixture else {}
             goals = WindowGoal(
-                self.environment.layout,
-                window=self.window,
-                mixture=dict(self.settings.future_goals),
+                self.environment.layout, window=self.window, mixture=mixture, **offset
             )
         return imitation_buffer(
             self,
