@@ -25,6 +25,7 @@ LAYERS = [
         "_keys",
         "_processes",
         "_random",
+        "_sampling",
         "_spread",
         "_torchrl",
         "_whole_files",

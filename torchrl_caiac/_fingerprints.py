@@ -11,6 +11,7 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join, path
+from torchrl_caiac._sampling import is_native, is_native_source, state_matches
 from torchrl_caiac._torchrl import leaf_of
 
 __all__ = [
@@ -139,12 +140,40 @@ def matches(
     Returns:
         torch.Tensor: bool ``[B]``.
     """
+    found = _matched(td, known, keys, next_keys, names, rows)
+    if found is not None:
+        return found
     left = known if rows is None else known.index_select(0, rows)
     for entries, factor in ((keys, 1), (next_keys, _NEXT)):
         for number, leaf in enumerate(state_leaves(td, entries)):
             leaf = leaf if rows is None else leaf.index_select(0, rows)
             left = left - _weighted(_lanes(leaf), number, factor)
     return left >> 32 == _upper_half(tuple(names))
+
+
+def _matched(
+    td: TensorDictBase,
+    known: torch.Tensor,
+    keys: Sequence[NestedKey],
+    next_keys: Sequence[NestedKey],
+    names: Sequence[str],
+    rows: torch.Tensor | None,
+) -> torch.Tensor | None:
+    """Returns what :func:`matches` does, in C; ``None`` if these data need torch."""
+    known = known.as_subclass(torch.Tensor)
+    if not is_native_source(known) or not is_native(known if rows is None else rows):
+        return None
+    leaves, weights = [], []
+    for entries, factor in ((keys, 1), (next_keys, _NEXT)):
+        for number, leaf in enumerate(state_leaves(td, entries)):
+            leaf = leaf.as_subclass(torch.Tensor)
+            if leaf.dtype is not torch.float32 or leaf.ndim != 2:
+                return None
+            leaves.append(leaf)
+            weights.append(_weights(leaf.shape[1], number, factor, leaf.device))
+    if not is_native_source(*leaves):
+        return None
+    return state_matches(leaves, weights, known, _upper_half(tuple(names)), rows)
 
 
 def is_fingerprint_of(

@@ -19,6 +19,7 @@ from torchrl_caiac._fingerprints import (
     state_leaves,
 )
 from torchrl_caiac._keys import missing_key
+from torchrl_caiac._sampling import all_finite, is_native
 from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flags
@@ -159,7 +160,7 @@ class BatchCheck:
         """
         leaves = [leaf_of(td, key) for key in states]
         if not LateCheck.needed(checked.scores.device):
-            if not math.isfinite(sum(leaf.sum().item() for leaf in leaves)):
+            if not all(map(_is_finite, leaves)):
                 self._explain_states(td, states)
             return
         found = self._late.found()
@@ -398,3 +399,10 @@ def _check_size(leaf: torch.Tensor, key: NestedKey | None, td: TensorDictBase) -
             f"{key!r} has shape {list(leaf.shape)}, expected [{len(td)}] or "
             f"[{len(td)}, 1]: one value for each row"
         )
+
+
+def _is_finite(leaf: torch.Tensor) -> bool:
+    if leaf.dtype is torch.float32 and is_native(leaf):
+        return all_finite(leaf)
+    # A sum is finite if all its terms are.
+    return math.isfinite(leaf.sum().item())

@@ -8,11 +8,12 @@ them, or the last ones), ``N`` the number of entities.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
 from torchrl_caiac._random import draw_below, draw_numbers
+from torchrl_caiac._sampling import batch_donors, is_native
 from torchrl_caiac.transforms.indexing import pick_rows, window_max, window_starts
 
 __all__ = [
@@ -224,7 +225,11 @@ def _drawn(
     if swap_prob >= 1.0:
         return free
     chance = draw_numbers(
-        torch.rand, free.shape, device=free.device, generator=generator
+        torch.rand,
+        free.shape,
+        device=free.device,
+        generator=generator,
+        dtype=torch.float32,
     )
     return free & (chance < swap_prob)
 
@@ -269,6 +274,17 @@ def draw_batch_donors(
     """
     count, entities = free.shape
     first = count - num_windows
+    if num_windows and is_native(free, *(() if chosen is None else (chosen,))):
+        shape = entities, num_windows
+        options: dict[str, Any] = {"device": free.device, "generator": generator}
+        chance = None
+        if swap_prob < 1.0:
+            chance = draw_numbers(torch.rand, shape, **options, dtype=torch.float32)
+        share = draw_numbers(torch.rand, shape, **options, dtype=torch.float64)
+        drawn = batch_donors(
+            free, num_windows, window, swap_prob, chosen, chance, share
+        )
+        return SwapDraw(*drawn, chosen=chosen)
     free = free.t().contiguous()
     tail = free[:, first:] if first else free
     is_chosen = _drawn(tail, swap_prob, chosen, generator)

@@ -22,6 +22,7 @@ from tensordict import (
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join
+from torchrl_caiac._sampling import Runs, is_native, is_native_source, swap_rows
 from torchrl_caiac._torchrl import leaf_of, with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
@@ -44,6 +45,7 @@ class SwapLeaf(NamedTuple):
         width (int): its columns ``D``; 1 where it belongs to one entity.
         group (int): leaves of the same owner and width share their index.
         is_desired (bool): whether it is a desired goal.
+        runs (Runs): the bytes of each entity in a row.
     """
 
     key: NestedKey
@@ -52,6 +54,7 @@ class SwapLeaf(NamedTuple):
     width: int
     group: int
     is_desired: bool
+    runs: Runs
 
 
 class SwapPlan(NamedTuple):
@@ -185,8 +188,12 @@ class SwapPlanner:
                 owner = torch.where(owner < 0, len(layout), owner)
                 owners[kind] = len(owners), owner.to(value.device)
             group, owner = owners[kind]
+            known = [n if n < len(layout) else -1 for n in owner.tolist()]
+            runs = Runs.of(known, value.element_size())
             leaves.append(
-                SwapLeaf(source.key, place, owner, width, group, source.is_desired)
+                SwapLeaf(
+                    source.key, place, owner, width, group, source.is_desired, runs
+                )
             )
         states = [
             source.key
@@ -214,8 +221,9 @@ class SwapPlanner:
                 )
             if source.is_swapped:
                 entity = source.entity
+                runs = Runs.of([entity], value[:1].nbytes)
                 leaves.append(
-                    SwapLeaf(key, place, entity, 1, entity, source.is_desired)
+                    SwapLeaf(key, place, entity, 1, entity, source.is_desired, runs)
                 )
             if source.is_required and value.is_floating_point():
                 states.append(key)
@@ -356,6 +364,10 @@ def apply_swap(
     changed = draw.swapped.shape[0]
     if not changed:
         return td.copy()
+    if goals is None and (window == 1 or trajectories is None):
+        swapped = _swapped(plan, values, draw, window, sources)
+        if swapped is not None:
+            return with_leaves(td, swapped)
     first = td.shape[0] - changed * window
     device, donors = draw.swapped.device, draw.donors
     own = window_starts(changed, window, device).unsqueeze(-1)
@@ -407,6 +419,27 @@ def apply_swap(
             new = torch.where(masks[kind], new, tail).flatten(0, 1)
         leaves[leaf.key] = torch.cat([value[:first], new]) if first else new
     return with_leaves(td, leaves)
+
+
+def _swapped(
+    plan: SwapPlan,
+    values: Sequence[torch.Tensor],
+    draw: SwapDraw,
+    window: int,
+    sources: Sequence[torch.Tensor] | None,
+) -> dict[NestedKey, torch.Tensor] | None:
+    """Returns the new leaves, by C; ``None`` if these tensors need torch."""
+    own = [values[leaf.place] for leaf in plan.leaves]
+    found = own if sources is None else sources
+    donors, swapped = draw.donors.contiguous(), draw.swapped.contiguous()
+    if not is_native(donors, swapped, *own) or donors.dtype is not torch.int64:
+        return None
+    if sources is not None and not is_native_source(*sources):
+        return None
+    return {
+        leaf.key: swap_rows(value, source, leaf.runs, donors, swapped, window)
+        for leaf, value, source in zip(plan.leaves, own, found, strict=True)
+    }
 
 
 @lru_cache(maxsize=64)

@@ -1,0 +1,249 @@
+"""The functions in C give the numbers of torch, to the bit."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from torchrl_caiac import EntityLayout, _sampling
+from torchrl_caiac._fingerprints import fingerprint, matches, state_hash
+from torchrl_caiac._sampling import Runs, all_finite, is_native, only_torch
+from torchrl_caiac.transforms.draws import draw_batch_donors
+from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
+
+KINDS = [torch.float32, torch.float64, torch.float16, torch.uint8, torch.int64]
+
+
+def both(function: Any) -> tuple[Any, Any]:
+    """What C and what torch return."""
+    assert is_native()
+    in_c = function()
+    with only_torch():
+        return in_c, function()
+
+
+def bits(tensor: torch.Tensor) -> bytes:
+    return tensor.contiguous().view(torch.uint8).numpy().tobytes()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    shape=st.tuples(st.integers(1, 12), st.integers(1, 4)),
+    drawn=st.integers(0, 12),
+    window=st.integers(1, 3),
+    swap_prob=st.sampled_from([1.0, 0.5, 0.0]),
+    has_chosen=st.booleans(),
+    share=st.sampled_from([0.0, 0.2, 0.7, 1.0]),
+    seed=st.integers(0, 1000),
+)
+def test_donors_of_a_batch(
+    shape: tuple[int, int],
+    drawn: int,
+    window: int,
+    swap_prob: float,
+    has_chosen: bool,
+    share: float,
+    seed: int,
+) -> None:
+    drawn = min(drawn, shape[0])
+    of = torch.Generator().manual_seed(seed)
+    free = torch.rand(shape, generator=of) < share
+    chosen = torch.rand(drawn, generator=of) < 0.5 if has_chosen else None
+    in_c, in_torch = both(
+        lambda: draw_batch_donors(
+            free,
+            drawn,
+            window=window,
+            swap_prob=swap_prob,
+            chosen=chosen,
+            generator=torch.Generator().manual_seed(seed),
+        )
+    )
+    for name in ("donors", "swapped", "no_donor"):
+        assert torch.equal(getattr(in_c, name), getattr(in_torch, name)), name
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    owners=st.lists(st.integers(-1, 2), min_size=3, max_size=8),
+    dtype=st.sampled_from(KINDS),
+    windows=st.integers(1, 8),
+    window=st.integers(1, 3),
+    drawn=st.integers(1, 8),
+    other=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_swapped_rows(
+    owners: list[int],
+    dtype: torch.dtype,
+    windows: int,
+    window: int,
+    drawn: int,
+    other: bool,
+    seed: int,
+) -> None:
+    drawn = min(drawn, windows)
+    owners = [0, 1, 2, *owners]
+    layout = EntityLayout(
+        {str(n): [c for c, owner in enumerate(owners) if owner == n] for n in range(3)}
+    )
+    of = torch.Generator().manual_seed(seed)
+
+    def values(rows: int) -> torch.Tensor:
+        found = torch.randint(0, 200, (rows, len(owners)), generator=of)
+        return found.to(dtype)
+
+    batch = TensorDict(
+        {
+            "observation": values(windows * window),
+            ("next", "observation"): values(windows * window),
+        },
+        [windows * window],
+    )
+    free = torch.rand(windows, 3, generator=of) < 0.7
+    draw = draw_batch_donors(free, drawn, window=window, generator=of)
+    planner = SwapPlanner(layout)
+    sources = [values(windows * window) for _ in range(2)] if other else None
+    in_c, in_torch = both(
+        lambda: apply_swap(batch, *planner(batch), draw, window=window, sources=sources)
+    )
+    for key in ("observation", ("next", "observation")):
+        assert bits(in_c[key]) == bits(in_torch[key])
+        assert in_c[key].dtype is dtype
+        assert in_c[key].data_ptr() != batch[key].data_ptr()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.integers(1, 9),
+    width=st.integers(1, 6),
+    changed=st.lists(st.integers(0, 8), max_size=3),
+    some=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_rows_that_changed(
+    rows: int, width: int, changed: list[int], some: bool, seed: int
+) -> None:
+    of = torch.Generator().manual_seed(seed)
+    state, after = (1e3 * torch.randn(rows, width, generator=of) for _ in "ab")
+    td = TensorDict({"x": state, ("next", "x"): after}, [rows])
+    first, then = state_hash(td, ["x"]), state_hash(td, [("next", "x")])
+    assert first is not None and then is not None
+    known = fingerprint(first, then, ("a", "b"), 5)
+    for row in changed:
+        if row < rows:
+            state[row, 0] = -state[row, 0]
+    picked = torch.randint(0, rows, (4,), generator=of) if some else None
+    in_c, in_torch = both(
+        lambda: matches(td, known, ["x"], [("next", "x")], ("a", "b"), picked)
+    )
+    assert torch.equal(in_c, in_torch)
+    whole = torch.ones(rows, dtype=torch.bool)
+    whole[[row for row in changed if row < rows and changed.count(row) % 2]] = False
+    assert torch.equal(in_c, whole if picked is None else whole[picked])
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, 1e-45, 3.4e38, -3.4e38])
+def test_finite_numbers(value: float) -> None:
+    assert all_finite(torch.full((7,), value))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("place", [0, 6])
+def test_numbers_that_are_not_finite(value: float, place: int) -> None:
+    values = torch.zeros(7)
+    values[place] = value
+    assert not all_finite(values)
+
+
+def test_tensors_that_need_torch() -> None:
+    assert is_native(torch.zeros(3, 2))
+    assert not is_native(torch.zeros(3, 2).t())
+    assert not is_native(torch.zeros(3, requires_grad=True))
+    assert not is_native(torch.nn.Buffer(torch.zeros(3)).to("meta"))
+    with only_torch():
+        assert not is_native()
+
+
+def test_runs_of_columns_apart() -> None:
+    runs = Runs.of([1, 0, 0, -1, 0, 1], itemsize=8)
+    assert runs.entity.tolist() == [1, 0, 0, 1]
+    assert runs.start.tolist() == [0, 8, 32, 40]
+    assert runs.length.tolist() == [8, 16, 8, 8]
+
+
+@pytest.fixture
+def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """An empty folder that compiled files are kept in."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    yield tmp_path / "torchrl_caiac"
+    monkeypatch.undo()
+    _sampling._library.cache_clear()
+    assert is_native()
+
+
+def is_native_anew() -> bool:
+    """What a new process finds."""
+    _sampling._library.cache_clear()
+    return is_native()
+
+
+def test_it_is_compiled_once(cache: Path) -> None:
+    assert is_native_anew()
+    (file,) = cache.iterdir()
+    before = file.stat().st_mtime_ns
+    assert is_native_anew()
+    assert file.stat().st_mtime_ns == before
+    assert not file.stat().st_mode & 0o077
+
+
+@pytest.mark.parametrize("damage", ["bytes", "rights", "folder"])
+def test_a_kept_file_that_is_not_loaded(cache: Path, damage: str) -> None:
+    assert is_native_anew()
+    (file,) = cache.iterdir()
+    before = file.stat().st_ino
+    file.unlink()
+    if damage == "bytes":
+        file.write_bytes(b"damaged")
+        file.chmod(0o700)
+    elif damage == "rights":  # others could have written it
+        file.write_bytes(b"")
+        file.chmod(0o777)
+    else:
+        cache.rmdir()
+        cache.write_text("no folder")
+    assert is_native_anew()
+    if damage != "folder":
+        assert file.stat().st_size > 1000
+        assert file.stat().st_ino != before
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"PATH": "/nowhere"}, "there is no C compiler"),
+        ({"CC": "/bin/false"}, "non-zero exit status"),
+        ({"TORCHRL_CAIAC_NATIVE": "0"}, ""),
+    ],
+)
+def test_without_a_compiler(
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    variables: dict[str, str],
+    message: str,
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with caplog.at_level(logging.INFO, "torchrl_caiac"):
+        assert not is_native_anew()
+    assert message in caplog.text
+    assert ("apt-get install gcc" in caplog.text) == bool(message)

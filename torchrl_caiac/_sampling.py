@@ -1,0 +1,359 @@
+"""What sampling does to each row, in C: compiled where it runs, by the C compiler.
+
+Each function gives the numbers of its reference, which computes them by operations of
+torch, to the bit. Without a compiler the reference is used.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import logging
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from torchrl_caiac._kernels import machine, processor_slug
+
+__all__ = [
+    "Runs",
+    "all_finite",
+    "batch_donors",
+    "is_native",
+    "is_native_source",
+    "only_torch",
+    "state_matches",
+    "swap_rows",
+]
+
+_logger = logging.getLogger("torchrl_caiac")
+
+_SOURCE = Path(__file__).with_suffix(".c")
+_FLAGS = ("-O3", "-march=native", "-std=c99", "-shared", "-fPIC")
+_SECONDS = 60  # for compiling
+# Numbers of a batch from which torch, with several threads, may be faster.
+_MOST = 1 << 22
+_off: ContextVar[bool] = ContextVar("only_torch", default=False)
+
+
+class Runs(NamedTuple):
+    """Where the entities are in a row of a leaf.
+
+    Attributes:
+        entity (torch.Tensor): the entity of each run of bytes, int64 ``[R]``.
+        start (torch.Tensor): its first byte in the row, int64 ``[R]``.
+        length (torch.Tensor): its bytes, int64 ``[R]``.
+    """
+
+    entity: torch.Tensor
+    start: torch.Tensor
+    length: torch.Tensor
+
+    @classmethod
+    def of(cls, owners: Sequence[int], itemsize: int) -> Runs:
+        """Returns the runs of columns with these owners; -1 is nobody.
+
+        Examples:
+            >>> from torchrl_caiac._sampling import Runs
+            >>> Runs.of([0, 0, -1, 1], itemsize=4).start
+            tensor([ 0, 12])
+        """
+        runs: list[list[int]] = []
+        for column, owner in enumerate(owners):
+            if owner < 0:
+                continue
+            if runs and runs[-1][0] == owner and sum(runs[-1][1:]) == column * itemsize:
+                runs[-1][2] += itemsize
+            else:
+                runs.append([owner, column * itemsize, itemsize])
+        table = torch.tensor(runs, dtype=torch.int64).reshape(-1, 3)
+        return cls(*(x.contiguous() for x in table.unbind(1)))
+
+
+@contextmanager
+def only_torch() -> Iterator[None]:
+    """Uses the reference inside of the block.
+
+    Examples:
+        >>> from torchrl_caiac._sampling import is_native, only_torch
+        >>> with only_torch():
+        ...     is_native()
+        False
+    """
+    token = _off.set(True)
+    try:
+        yield
+    finally:
+        _off.reset(token)
+
+
+def is_native(*tensors: torch.Tensor) -> bool:
+    """Returns whether tensors are computed in C: plain, contiguous, on the CPU.
+
+    Args:
+        *tensors (torch.Tensor): the tensors.
+
+    Returns:
+        bool: whether they are, and C can be used here.
+    """
+    if not is_native_source(*tensors):
+        return False
+    if any(x.numel() > _MOST for x in tensors) and torch.get_num_threads() > 1:
+        return False
+    if _off.get() or torch.compiler.is_compiling():
+        return False
+    return _library() is not None
+
+
+def is_native_source(*tensors: torch.Tensor) -> bool:
+    """Returns whether tensors of any size can be read in C."""
+    return all(
+        type(x) is torch.Tensor
+        and x.device.type == "cpu"
+        and x.is_contiguous()
+        and not x.requires_grad
+        for x in tensors
+    )
+
+
+def state_matches(
+    leaves: Sequence[torch.Tensor],
+    weights: Sequence[torch.Tensor],
+    known: torch.Tensor,
+    upper: int,
+    rows: torch.Tensor | None,
+) -> torch.Tensor:
+    """Returns which rows have the states of their fingerprints.
+
+    Args:
+        leaves (sequence of torch.Tensor): states and next states, float32 or int32
+            ``[T, L]`` each.
+        weights (sequence of torch.Tensor): for each leaf int64 ``[L]``.
+        known (torch.Tensor): the fingerprints, int64 ``[T]``.
+        upper (int): the upper half of a fingerprint, less the hash of the states.
+        rows (torch.Tensor, optional): int64 ``[B]``, the rows to compare; all of them
+            if it is ``None``.
+
+    Returns:
+        torch.Tensor: bool ``[B]``.
+    """
+    count = len(known) if rows is None else len(rows)
+    valid = torch.empty(count, dtype=torch.bool)
+    _call(
+        "state_matches",
+        count,
+        0 if rows is None else rows.data_ptr(),
+        len(leaves),
+        _pointers(leaves),
+        (ctypes.c_int64 * len(leaves))(*(leaf.shape[1] for leaf in leaves)),
+        _pointers(weights),
+        known.data_ptr(),
+        upper,
+        valid.data_ptr(),
+    )
+    return valid
+
+
+def batch_donors(
+    free: torch.Tensor,
+    drawn: int,
+    window: int,
+    swap_prob: float,
+    chosen: torch.Tensor | None,
+    chance: torch.Tensor | None,
+    share: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Returns donors among the windows of a batch, from random numbers.
+
+    Args:
+        free (torch.Tensor): bool ``[B, N]``, the entities that may be swapped.
+        drawn (int): the number of windows that donors are drawn for, ``C``: the last
+            ones of the batch.
+        window (int): rows in a window.
+        swap_prob (float): the chance below which a free entity is swapped.
+        chosen (torch.Tensor, optional): bool ``[C]``, which windows become
+            counterfactual.
+        chance (torch.Tensor, optional): float32 ``[N, C]``, below 1.
+        share (torch.Tensor): float64 ``[N, C]``, below 1: which donor it is.
+
+    Returns:
+        tuple of torch.Tensor: donors int64 ``[C, N]``, swapped bool ``[C, N]``, and
+        without a donor int64 ``[N]``.
+    """
+    count, entities = free.shape
+    donors = torch.empty(drawn, entities, dtype=torch.int64)
+    swapped = torch.empty(drawn, entities, dtype=torch.bool)
+    no_donor = torch.empty(entities, dtype=torch.int64)
+    listed = torch.empty(count, dtype=torch.int64)
+    _call(
+        "batch_donors",
+        count,
+        count - drawn,
+        entities,
+        window,
+        free.data_ptr(),
+        0 if chosen is None else chosen.data_ptr(),
+        0 if chance is None else chance.data_ptr(),
+        swap_prob,
+        share.data_ptr(),
+        listed.data_ptr(),
+        donors.data_ptr(),
+        swapped.data_ptr(),
+        no_donor.data_ptr(),
+    )
+    return donors, swapped, no_donor
+
+
+def swap_rows(
+    own: torch.Tensor,
+    source: torch.Tensor,
+    runs: Runs,
+    donors: torch.Tensor,
+    swapped: torch.Tensor,
+    window: int,
+) -> torch.Tensor:
+    """Returns the rows of a batch, in which entities are those of their donors.
+
+    Args:
+        own (torch.Tensor): the rows, ``[B * window, ...]``.
+        source (torch.Tensor): what donors are rows of, ``[T, ...]``.
+        runs (Runs): where the entities are in a row.
+        donors (torch.Tensor): the first row of each donor, int64 ``[C, N]``.
+        swapped (torch.Tensor): which entities of the last ``C`` windows are swapped,
+            bool ``[C, N]``.
+        window (int): rows in a window.
+
+    Returns:
+        torch.Tensor: ``[B * window, ...]``.
+    """
+    out = torch.empty_like(own)
+    drawn, entities = swapped.shape
+    _call(
+        "swap_rows",
+        len(own) - drawn * window,
+        drawn,
+        window,
+        entities,
+        donors.data_ptr(),
+        swapped.data_ptr(),
+        own.nbytes // len(own),
+        len(runs.entity),
+        runs.entity.data_ptr(),
+        runs.start.data_ptr(),
+        runs.length.data_ptr(),
+        own.data_ptr(),
+        source.data_ptr(),
+        out.data_ptr(),
+    )
+    return out
+
+
+def all_finite(values: torch.Tensor) -> bool:
+    """Returns whether all numbers of a float32 tensor are finite."""
+    return bool(_call("all_finite", values.numel(), values.data_ptr()))
+
+
+# --- the library ---------------------------------------------------------------------
+
+
+def _pointers(tensors: Sequence[torch.Tensor]) -> Any:
+    return (ctypes.c_void_p * len(tensors))(*(x.data_ptr() for x in tensors))
+
+
+def _call(name: str, *args: Any) -> Any:
+    functions = _library()
+    assert functions is not None  # is_native() is true
+    return functions[name](*args)
+
+
+_P, _I = ctypes.c_void_p, ctypes.c_int64
+_ARGUMENTS: dict[str, list[Any]] = {
+    "state_matches": [_I, _P, _I, _P, _P, _P, _P, _I, _P],
+    "batch_donors": [*[_I] * 4, *[_P] * 3, ctypes.c_float, *[_P] * 5],
+    "swap_rows": [*[_I] * 4, _P, _P, _I, _I, *[_P] * 6],
+    "all_finite": [_I, _P],
+}
+
+
+@cache
+def _library() -> dict[str, Callable[..., Any]] | None:
+    """Returns the functions in C, ``None`` if they cannot be compiled."""
+    if os.environ.get("TORCHRL_CAIAC_NATIVE") == "0":
+        return None
+    try:
+        library = _load()
+    except (OSError, subprocess.SubprocessError) as error:
+        _logger.info(
+            "sampling is slower, as its functions in C are not compiled: %s. Install a "
+            "C compiler (apt-get install gcc), or name one in the environment "
+            "variable CC",
+            error,
+        )
+        return None
+    functions = {}
+    for name, arguments in _ARGUMENTS.items():
+        function = getattr(library, name)
+        function.argtypes = arguments
+        function.restype = ctypes.c_int32 if name == "all_finite" else None
+        functions[name] = function
+    return functions
+
+
+def _load() -> ctypes.CDLL:
+    """Loads the library of this processor, which is compiled once."""
+    names = (os.environ.get("CC"), "cc", "gcc", "clang")
+    compiler = next((found for n in names if n and (found := shutil.which(n))), None)
+    if compiler is None:
+        raise FileNotFoundError("there is no C compiler")
+    own = {**machine(), "flags": _FLAGS, "compiler": compiler}
+    del own["threads"]
+    key = _SOURCE.read_bytes() + json.dumps(own).encode()
+    slug = processor_slug(str(own["processor"]))
+    name = f"sampling-{slug}-{hashlib.sha256(key).hexdigest()[:12]}.so"
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    file = Path(folder, "torchrl_caiac", name)
+    if _is_mine(file):
+        try:
+            return ctypes.CDLL(str(file))
+        except OSError as error:  # damaged
+            _logger.debug("%s is compiled again: %s", file, error)
+    with tempfile.TemporaryDirectory(dir=_folder(file.parent)) as work:
+        made = Path(work, name)
+        subprocess.run(
+            [compiler, *_FLAGS, str(_SOURCE), "-o", str(made)],
+            check=True,
+            capture_output=True,
+            timeout=_SECONDS,
+        )
+        library = ctypes.CDLL(str(made))
+        if made.parent.parent == file.parent:
+            made.chmod(0o700)
+            made.replace(file)  # for the next process
+    return library  # it stays loaded without its file
+
+
+def _is_mine(file: Path) -> bool:
+    """Returns whether this user alone can have written a file."""
+    if not file.is_absolute() or not file.is_file():
+        return False
+    status = file.stat()
+    return status.st_uid == os.geteuid() and not status.st_mode & 0o022
+
+
+def _folder(wanted: Path) -> Path | None:
+    """Returns a folder to compile in; ``None``, the one of the system, if need be."""
+    try:
+        wanted.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return wanted if wanted.is_absolute() and os.access(wanted, os.W_OK) else None
