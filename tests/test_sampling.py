@@ -15,8 +15,20 @@ from tensordict import TensorDict
 
 from torchrl_caiac import EntityLayout, _sampling
 from torchrl_caiac._fingerprints import fingerprint, matches, state_hash
-from torchrl_caiac._sampling import Runs, all_finite, is_native, only_torch
-from torchrl_caiac.transforms.draws import draw_batch_donors
+from torchrl_caiac._sampling import (
+    Runs,
+    all_finite,
+    is_native,
+    only_torch,
+    read_columns,
+    swap_rows,
+)
+from torchrl_caiac.transforms import HindsightGoal
+from torchrl_caiac.transforms.draws import (
+    DonorIndex,
+    draw_batch_donors,
+    draw_buffer_donors,
+)
 from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
 
 KINDS = [torch.float32, torch.float64, torch.float16, torch.uint8, torch.int64]
@@ -119,6 +131,109 @@ def test_swapped_rows(
         assert bits(in_c[key]) == bits(in_torch[key])
         assert in_c[key].dtype is dtype
         assert in_c[key].data_ptr() != batch[key].data_ptr()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    shape=st.tuples(st.integers(1, 8), st.integers(1, 3)),
+    sizes=st.lists(st.integers(0, 4), min_size=3, max_size=3),
+    is_short=st.booleans(),
+    swap_prob=st.sampled_from([1.0, 0.5]),
+    has_chosen=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_donors_of_a_buffer(
+    shape: tuple[int, int],
+    sizes: list[int],
+    is_short: bool,
+    swap_prob: float,
+    has_chosen: bool,
+    seed: int,
+) -> None:
+    of = torch.Generator().manual_seed(seed)
+    free = torch.rand(shape, generator=of) < 0.7
+    chosen = torch.rand(shape[0], generator=of) < 0.5 if has_chosen else None
+    size = torch.tensor(sizes[: shape[1]])
+    starts = torch.randint(0, 99, (max(1, int(size.sum())),), generator=of)
+    index = DonorIndex(
+        starts.int() if is_short else starts, size.cumsum(0) - size, size
+    )
+    in_c, in_torch = both(
+        lambda: draw_buffer_donors(
+            free,
+            index,
+            swap_prob=swap_prob,
+            chosen=chosen,
+            generator=torch.Generator().manual_seed(seed),
+        )
+    )
+    for name in ("donors", "swapped", "no_donor"):
+        assert torch.equal(getattr(in_c, name), getattr(in_torch, name)), name
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    rows=st.integers(1, 12),
+    share=st.sampled_from([0.0, 0.5, 1.0]),
+    future=st.sampled_from([0.0, 0.3, 0.5]),
+    random=st.sampled_from([0.0, 0.2, 0.5]),
+    counterfactual=st.sampled_from([0.0, 0.3, 0.5, 1.0]),
+    seed=st.integers(0, 1000),
+)
+def test_sources_of_hindsight_goals(
+    rows: int,
+    share: float,
+    future: float,
+    random: float,
+    counterfactual: float,
+    seed: int,
+) -> None:
+    layout = EntityLayout({"b": [0]}, goal={"b": [0]}, achieved={"b": [0]})
+    goals = HindsightGoal(
+        layout,
+        lambda achieved, desired: achieved[..., 0],
+        future=future,
+        random=random,
+        counterfactual=counterfactual,
+    )
+    flags = torch.rand(rows, 1, generator=torch.Generator().manual_seed(seed)) < share
+    in_c, in_torch = both(
+        lambda: goals.generate_parameters(
+            flags,
+            {"desired_goal": torch.zeros(rows, 1)},
+            torch.Generator().manual_seed(seed),
+        )
+    )
+    assert torch.equal(in_c.source, in_torch.source)
+
+
+@given(
+    columns=st.lists(st.integers(0, 4), min_size=1, max_size=6),
+    dtype=st.sampled_from(KINDS),
+    rows=st.none() | st.lists(st.integers(0, 5), max_size=4),
+)
+def test_columns_of_rows(
+    columns: list[int], dtype: torch.dtype, rows: list[int] | None
+) -> None:
+    source = torch.arange(30).view(6, 5).to(dtype)
+    picked = None if rows is None else torch.tensor(rows, dtype=torch.int64)
+    found = read_columns(source, columns, picked)
+    wanted = source if picked is None else source[picked]
+    assert torch.equal(found, wanted[:, columns])
+
+
+@pytest.mark.parametrize("row", [-1, -2, 3, 1 << 40])
+def test_rows_out_of_range(row: int) -> None:
+    state, rows = torch.zeros(3, 2), torch.tensor([0, row])
+    with pytest.raises(IndexError, match=f"row {row} is out of range: there are 3"):
+        read_columns(state, [0], rows)
+    with pytest.raises(IndexError, match=f"row {row} is out of range"):
+        matches(
+            TensorDict({"x": state}, [3]), torch.zeros(3).long(), ["x"], [], "a", rows
+        )
+    with pytest.raises(IndexError, match=f"row {row} is out of range"):
+        donors, swapped = rows.view(2, 1), torch.ones(2, 1, dtype=torch.bool)
+        swap_rows(state, state, Runs.of([0, 0], 4), donors, swapped, 1)
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,22 +1,27 @@
 /* What sampling does to each row, without one operation of torch after the other.
  *
  * Each function gives the numbers of its reference in Python, to the bit; see
- * _sampling.py. All tensors are contiguous and on the CPU.
+ * _sampling.py. All tensors are contiguous and on the CPU. Each returns the
+ * first row that is out of range, or GOOD.
  */
 #include <stdint.h>
 #include <string.h>
 
+#define GOOD INT64_MIN
 #define AHEAD 8 /* rows whose donors are fetched before they are needed */
 
 /* _fingerprints.matches: which rows have the states of their fingerprints. */
-void state_matches(int64_t rows, const int64_t *places, int64_t leaves,
-                   const int32_t *const *values, const int64_t *widths,
+int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
+                   int64_t leaves, const int32_t *const *values, const int64_t *widths,
                    const int64_t *const *weights, const int64_t *known,
                    int64_t upper, uint8_t *valid)
 {
     for (int64_t r = 0; r < rows; r++) {
         int64_t place = places ? places[r] : r;
-        uint64_t left = (uint64_t)known[place];
+        uint64_t left;
+        if (place < 0 || place >= length)
+            return place;
+        left = (uint64_t)known[place];
         for (int64_t l = 0; l < leaves; l++) {
             const int32_t *value = values[l] + place * widths[l];
             const int64_t *weight = weights[l];
@@ -27,10 +32,11 @@ void state_matches(int64_t rows, const int64_t *places, int64_t leaves,
         }
         valid[r] = ((int64_t)left >> 32) == upper;
     }
+    return GOOD;
 }
 
 /* draws.draw_batch_donors, after its random numbers were drawn. */
-void batch_donors(int64_t count, int64_t first, int64_t entities, int64_t window,
+int64_t batch_donors(int64_t count, int64_t first, int64_t entities, int64_t window,
                   const uint8_t *is_free, const uint8_t *chosen, const float *chance,
                   float swap_prob, const double *share, int64_t *listed,
                   int64_t *donors, uint8_t *swapped, int64_t *no_donor)
@@ -59,14 +65,94 @@ void batch_donors(int64_t count, int64_t first, int64_t entities, int64_t window
         }
         no_donor[n] = missing;
     }
+    return GOOD;
+}
+
+/* draws.draw_buffer_donors, after its random numbers were drawn. */
+int64_t buffer_donors(int64_t drawn, int64_t entities, const uint8_t *is_free,
+                   const uint8_t *chosen, const float *chance, float swap_prob,
+                   const double *share, const int64_t *offset, const int64_t *size,
+                   int64_t length, int64_t is_short, const void *starts,
+                   int64_t *donors, uint8_t *swapped, int64_t *no_donor)
+{
+    memset(no_donor, 0, (size_t)entities * sizeof(int64_t));
+    for (int64_t c = 0; c < drawn; c++)
+        for (int64_t n = 0; n < entities; n++) {
+            int64_t here = c * entities + n;
+            int64_t place = (int64_t)(share[here] * (double)size[n]) + offset[n];
+            uint8_t is_chosen = is_free[here];
+            place = place < 0 ? 0 : place >= length ? length - 1 : place;
+            donors[here] = is_short ? ((const int32_t *)starts)[place]
+                                    : ((const int64_t *)starts)[place];
+            if (chosen)
+                is_chosen &= chosen[c];
+            if (chance)
+                is_chosen &= chance[n * drawn + c] < swap_prob;
+            swapped[here] = is_chosen && size[n] > 0;
+            no_donor[n] += is_chosen && size[n] <= 0;
+        }
+    return GOOD;
+}
+
+/* HindsightGoal.generate_parameters, after its random numbers were drawn. */
+int64_t hindsight_sources(int64_t rows, const uint8_t *flags, const double *chance,
+                       const double *pick, double future, double random,
+                       double counterfactual, int64_t *order, int64_t *source)
+{
+    int64_t size = 0, last;
+    for (int64_t r = 0; r < rows; r++)
+        if (flags[r])
+            order[size++] = r; /* counterfactual rows first */
+    last = size;
+    for (int64_t r = 0; r < rows; r++)
+        if (!flags[r])
+            order[last++] = r;
+    for (int64_t r = 0; r < rows; r++) {
+        double share = flags[r] ? counterfactual : future + random;
+        int64_t among = size, first = 0;
+        if (!(chance[r] < share)) {
+            source[r] = r;
+            continue;
+        }
+        if (!flags[r] && future > 0 && (random <= 0 || chance[r] < future)) {
+            source[r] = r + 2 * rows;
+            continue;
+        }
+        if (random > 0 && !flags[r]) {
+            first = size;
+            among = rows - size;
+        }
+        source[r] = order[(int64_t)(pick[r] * (double)among) + first] + rows;
+    }
+    return GOOD;
+}
+
+/* Some columns of rows: out[r] is made of runs of bytes of row places[r]. */
+int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
+                  int64_t row_bytes, int64_t runs, const int64_t *run_start, const int64_t *run_bytes,
+                  const char *source, char *out)
+{
+    for (int64_t r = 0; r < rows; r++) {
+        int64_t place = places ? places[r] : r;
+        const char *from = source + place * row_bytes;
+        if (place < 0 || place >= length)
+            return place;
+        if (places && r + AHEAD < rows)
+            __builtin_prefetch(source + places[r + AHEAD] * row_bytes + run_start[0]);
+        for (int64_t i = 0; i < runs; i++) {
+            memcpy(out, from + run_start[i], (size_t)run_bytes[i]);
+            out += run_bytes[i];
+        }
+    }
+    return GOOD;
 }
 
 /* swap.apply_swap: rows of a leaf, in which entities are those of their donors.
  *
  * An entity has runs of bytes in a row: run i is that of entity run_entity[i].
  */
-void swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities,
-               const int64_t *donors, const uint8_t *swapped, int64_t row_bytes,
+int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities,
+               int64_t length, const int64_t *donors, const uint8_t *swapped, int64_t row_bytes,
                int64_t runs, const int64_t *run_entity, const int64_t *run_start,
                const int64_t *run_bytes, const char *own, const char *source, char *out)
 {
@@ -85,13 +171,17 @@ void swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities,
             int64_t entity = run_entity[i];
             if (!is_swapped[entity])
                 continue;
-            const char *from = source + donors[c * entities + entity] * row_bytes;
+            int64_t donor = donors[c * entities + entity];
+            const char *from = source + donor * row_bytes;
             char *to = out + c * window * row_bytes;
+            if (donor < 0 || donor + window > length)
+                return donor;
             for (int64_t w = 0; w < window; w++)
                 memcpy(to + w * row_bytes + run_start[i],
                        from + w * row_bytes + run_start[i], (size_t)run_bytes[i]);
         }
     }
+    return GOOD;
 }
 
 /* Whether all float32 numbers are finite: their exponents are not all ones. */

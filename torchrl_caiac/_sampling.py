@@ -17,7 +17,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,9 +29,12 @@ __all__ = [
     "Runs",
     "all_finite",
     "batch_donors",
+    "buffer_donors",
+    "hindsight_sources",
     "is_native",
     "is_native_source",
     "only_torch",
+    "read_columns",
     "state_matches",
     "swap_rows",
 ]
@@ -43,6 +46,7 @@ _FLAGS = ("-O3", "-march=native", "-std=c99", "-shared", "-fPIC")
 _SECONDS = 60  # for compiling
 # Numbers of a batch from which torch, with several threads, may be faster.
 _MOST = 1 << 22
+_GOOD = -(1 << 63)  # what functions in C return if no row is out of range
 _off: ContextVar[bool] = ContextVar("only_torch", default=False)
 
 
@@ -149,9 +153,11 @@ def state_matches(
     """
     count = len(known) if rows is None else len(rows)
     valid = torch.empty(count, dtype=torch.bool)
-    _call(
+    _call_with_rows(
         "state_matches",
+        len(known),
         count,
+        len(known),
         0 if rows is None else rows.data_ptr(),
         len(leaves),
         _pointers(leaves),
@@ -214,6 +220,135 @@ def batch_donors(
     return donors, swapped, no_donor
 
 
+def buffer_donors(
+    free: torch.Tensor,
+    starts: torch.Tensor,
+    offset: torch.Tensor,
+    size: torch.Tensor,
+    swap_prob: float,
+    chosen: torch.Tensor | None,
+    chance: torch.Tensor | None,
+    share: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Returns donors among the eligible windows of a storage, from random numbers.
+
+    Args:
+        free (torch.Tensor): bool ``[C, N]``, the entities that may be swapped.
+        starts (torch.Tensor): eligible rows, int32 or int64 ``[M]``, entity by entity.
+        offset (torch.Tensor): where those of an entity begin, int64 ``[N]``.
+        size (torch.Tensor): how many it has, int64 ``[N]``.
+        swap_prob (float): the chance below which a free entity is swapped.
+        chosen (torch.Tensor, optional): bool ``[C]``, which windows become
+            counterfactual.
+        chance (torch.Tensor, optional): float32 ``[N, C]``, below 1.
+        share (torch.Tensor): float64 ``[C, N]``, below 1: which donor it is.
+
+    Returns:
+        tuple of torch.Tensor: as of :func:`batch_donors`.
+    """
+    donors = torch.empty(free.shape, dtype=torch.int64)
+    swapped = torch.empty(free.shape, dtype=torch.bool)
+    no_donor = torch.empty(free.shape[1], dtype=torch.int64)
+    _call(
+        "buffer_donors",
+        *free.shape,
+        free.data_ptr(),
+        0 if chosen is None else chosen.data_ptr(),
+        0 if chance is None else chance.data_ptr(),
+        swap_prob,
+        share.data_ptr(),
+        offset.data_ptr(),
+        size.data_ptr(),
+        len(starts),
+        starts.dtype is torch.int32,
+        starts.data_ptr(),
+        donors.data_ptr(),
+        swapped.data_ptr(),
+        no_donor.data_ptr(),
+    )
+    return donors, swapped, no_donor
+
+
+def hindsight_sources(
+    flags: torch.Tensor,
+    chance: torch.Tensor,
+    pick: torch.Tensor,
+    future: float,
+    random: float,
+    counterfactual: float,
+) -> torch.Tensor:
+    """Returns where the goals of rows come from, from random numbers.
+
+    Args:
+        flags (torch.Tensor): which rows are counterfactual, bool ``[B]``.
+        chance (torch.Tensor): float64 ``[B]``, below 1: whether a row is relabelled.
+        pick (torch.Tensor): float64 ``[B]``, below 1: whose goal it gets.
+        future (float): the share of real rows that get a future goal.
+        random (float): the share of real rows that get that of another one.
+        counterfactual (float): the share of counterfactual rows that are relabelled.
+
+    Returns:
+        torch.Tensor: int64 ``[B]``, below ``3 B``, see ``HindsightDraw``.
+    """
+    order, source = torch.empty(2, len(flags), dtype=torch.int64).unbind()
+    _call(
+        "hindsight_sources",
+        len(flags),
+        flags.data_ptr(),
+        chance.data_ptr(),
+        pick.data_ptr(),
+        future,
+        random,
+        counterfactual,
+        order.data_ptr(),
+        source.data_ptr(),
+    )
+    return source
+
+
+def read_columns(
+    source: torch.Tensor, columns: Sequence[int], rows: torch.Tensor | None
+) -> torch.Tensor:
+    """Returns some columns of some rows.
+
+    Args:
+        source (torch.Tensor): ``[T, D]``.
+        columns (sequence of int): the columns, at least one.
+        rows (torch.Tensor, optional): int64 ``[M]``; all rows if it is ``None``.
+
+    Returns:
+        torch.Tensor: ``[M, len(columns)]``.
+    """
+    count = len(source) if rows is None else len(rows)
+    out = torch.empty(count, len(columns), dtype=source.dtype)
+    runs = _column_runs(tuple(columns), source.element_size())
+    _call_with_rows(
+        "read_columns",
+        len(source),
+        count,
+        len(source),
+        0 if rows is None else rows.data_ptr(),
+        source.shape[1] * source.element_size(),
+        len(runs.start),
+        runs.start.data_ptr(),
+        runs.length.data_ptr(),
+        source.data_ptr(),
+        out.data_ptr(),
+    )
+    return out
+
+
+@lru_cache(maxsize=64)
+def _column_runs(columns: tuple[int, ...], itemsize: int) -> Runs:
+    runs: list[list[int]] = []
+    for column in columns:
+        if runs and sum(runs[-1][1:]) == column * itemsize:
+            runs[-1][2] += itemsize
+        else:
+            runs.append([0, column * itemsize, itemsize])
+    return Runs(*torch.tensor(runs).t().contiguous())
+
+
 def swap_rows(
     own: torch.Tensor,
     source: torch.Tensor,
@@ -238,12 +373,14 @@ def swap_rows(
     """
     out = torch.empty_like(own)
     drawn, entities = swapped.shape
-    _call(
+    _call_with_rows(
         "swap_rows",
+        len(source),
         len(own) - drawn * window,
         drawn,
         window,
         entities,
+        len(source),
         donors.data_ptr(),
         swapped.data_ptr(),
         own.nbytes // len(own),
@@ -276,11 +413,20 @@ def _call(name: str, *args: Any) -> Any:
     return functions[name](*args)
 
 
+def _call_with_rows(name: str, length: int, *args: Any) -> None:
+    bad = _call(name, *args)
+    if bad != _GOOD:
+        raise IndexError(f"row {bad} is out of range: there are {length} rows")
+
+
 _P, _I = ctypes.c_void_p, ctypes.c_int64
 _ARGUMENTS: dict[str, list[Any]] = {
-    "state_matches": [_I, _P, _I, _P, _P, _P, _P, _I, _P],
+    "state_matches": [_I, _I, _P, _I, _P, _P, _P, _P, _I, _P],
     "batch_donors": [*[_I] * 4, *[_P] * 3, ctypes.c_float, *[_P] * 5],
-    "swap_rows": [*[_I] * 4, _P, _P, _I, _I, *[_P] * 6],
+    "buffer_donors": [_I, _I, *[_P] * 3, ctypes.c_float, *[_P] * 3, _I, _I, *[_P] * 4],
+    "hindsight_sources": [_I, *[_P] * 3, *[ctypes.c_double] * 3, _P, _P],
+    "read_columns": [_I, _I, _P, _I, _I, *[_P] * 4],
+    "swap_rows": [*[_I] * 5, _P, _P, _I, _I, *[_P] * 6],
     "all_finite": [_I, _P],
 }
 
@@ -304,7 +450,7 @@ def _library() -> dict[str, Callable[..., Any]] | None:
     for name, arguments in _ARGUMENTS.items():
         function = getattr(library, name)
         function.argtypes = arguments
-        function.restype = ctypes.c_int32 if name == "all_finite" else None
+        function.restype = ctypes.c_int32 if name == "all_finite" else ctypes.c_int64
         functions[name] = function
     return functions
 

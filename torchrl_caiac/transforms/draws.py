@@ -8,12 +8,17 @@ them, or the last ones), ``N`` the number of entities.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from torchrl_caiac._random import draw_below, draw_numbers
-from torchrl_caiac._sampling import batch_donors, is_native
+from torchrl_caiac._sampling import (
+    batch_donors,
+    buffer_donors,
+    is_native,
+    is_native_source,
+)
 from torchrl_caiac.transforms.indexing import pick_rows, window_max, window_starts
 
 __all__ = [
@@ -224,14 +229,17 @@ def _drawn(
         free = free & chosen
     if swap_prob >= 1.0:
         return free
-    chance = draw_numbers(
+    return free & (_chance(free, generator) < swap_prob)
+
+
+def _chance(free: torch.Tensor, generator: torch.Generator | None) -> torch.Tensor:
+    return draw_numbers(
         torch.rand,
         free.shape,
         device=free.device,
         generator=generator,
         dtype=torch.float32,
     )
-    return free & (chance < swap_prob)
 
 
 def draw_batch_donors(
@@ -275,12 +283,14 @@ def draw_batch_donors(
     count, entities = free.shape
     first = count - num_windows
     if num_windows and is_native(free, *(() if chosen is None else (chosen,))):
-        shape = entities, num_windows
-        options: dict[str, Any] = {"device": free.device, "generator": generator}
-        chance = None
-        if swap_prob < 1.0:
-            chance = draw_numbers(torch.rand, shape, **options, dtype=torch.float32)
-        share = draw_numbers(torch.rand, shape, **options, dtype=torch.float64)
+        chance = None if swap_prob >= 1.0 else _chance(free[first:].t(), generator)
+        share = draw_numbers(
+            torch.rand,
+            (entities, num_windows),
+            device=free.device,
+            generator=generator,
+            dtype=torch.float64,
+        )
         drawn = batch_donors(
             free, num_windows, window, swap_prob, chosen, chance, share
         )
@@ -340,6 +350,21 @@ def draw_buffer_donors(
         tensor([[ True, False]])
     """
     device = free.device
+    if (
+        isinstance(index, DonorIndex)
+        and is_native_source(*index)
+        and is_native(free, *(() if chosen is None else (chosen,)))
+    ):
+        chance = None if swap_prob >= 1.0 else _chance(free.t(), generator)
+        share = draw_numbers(
+            torch.rand,
+            free.shape,
+            device=device,
+            generator=generator,
+            dtype=torch.float64,
+        )
+        drawn = buffer_donors(free, *index, swap_prob, chosen, chance, share)
+        return SwapDraw(*drawn, chosen=chosen)
     is_chosen = _drawn(free.t(), swap_prob, chosen, generator).t()
     size = index.size.to(device)
     pick = draw_below(size.expand_as(free), generator=generator)

@@ -15,6 +15,7 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_below, draw_numbers
+from torchrl_caiac._sampling import is_native, is_native_source, read_columns
 from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
@@ -316,7 +317,11 @@ class FutureGoal(RandomTransform, SampleUnit):
         layout = self.layout
         if layout.is_flat:
             source, where = self.flat_source(data)
-            if rows is None:
+            if is_native_source(source) and is_native(
+                *(source,) if rows is None else (rows,)
+            ):
+                goals = read_columns(source, self._goal_columns[1], rows)
+            elif rows is None:
                 goals = source.gather(1, where.expand(source.shape[0], -1))
             else:
                 rows = rows.to(source.device).unsqueeze(-1)

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import floating
 from torchrl_caiac._random import draw_numbers
+from torchrl_caiac._sampling import hindsight_sources, is_native
 from torchrl_caiac._torchrl import leaf_of, with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
@@ -270,6 +271,11 @@ class HindsightGoal(FutureGoal):
             generator=generator,
             dtype=torch.float64,
         )
+        shares = self.future, self.random, self.counterfactual
+        if is_native(flags, chance, pick):
+            return HindsightDraw(
+                hindsight_sources(flags, chance, pick, *shares), future
+            )
         own = window_starts(rows, 1, device)
         # Counterfactual rows first: each kind draws among its own places.
         order = torch.argsort(flags.byte(), stable=True, descending=True)
@@ -285,11 +291,10 @@ class HindsightGoal(FutureGoal):
             if self.random > 0:
                 later = torch.where(is_future, later, goal)
             goal = torch.where(flags, goal, later)
-        share: Any = self.future + self.random
-        if self.counterfactual != share:
-            share = torch.where(flags, self.counterfactual, share)
-        source = torch.where(chance < share, goal, own)
-        return HindsightDraw(source, future)
+        is_new = chance < self.future + self.random
+        if self.counterfactual != self.future + self.random:
+            is_new = torch.where(flags, chance < self.counterfactual, is_new)
+        return HindsightDraw(torch.where(is_new, goal, own), future)
 
     # --- applying --------------------------------------------------------------------
 
