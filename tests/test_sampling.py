@@ -257,6 +257,8 @@ def test_rows_that_changed(
         if row < rows:
             state[row, 0] = -state[row, 0]
     picked = torch.randint(0, rows, (4,), generator=of) if some else None
+    hashes = both(lambda: state_hash(td, ["x", ("next", "x")]))
+    assert torch.equal(*hashes)
     in_c, in_torch = both(
         lambda: matches(td, known, ["x"], [("next", "x")], ("a", "b"), picked)
     )

@@ -11,7 +11,12 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join, path
-from torchrl_caiac._sampling import is_native, is_native_source, state_matches
+from torchrl_caiac._sampling import (
+    is_native,
+    is_native_source,
+    row_sums,
+    state_matches,
+)
 from torchrl_caiac._torchrl import leaf_of
 
 __all__ = [
@@ -77,7 +82,11 @@ def state_hash(
     """
     total: torch.Tensor | None = None
     for number, leaf in enumerate(state_leaves(td, keys)):
-        found = _weighted(_lanes(leaf if rows is None else leaf[rows]), number, 1)
+        leaf = leaf if rows is None else leaf[rows]
+        if leaf.dtype is torch.float32 and leaf.ndim == 2 and is_native(leaf):
+            found = row_sums(leaf, _weights(leaf.shape[1], number, 1, leaf.device))
+        else:
+            found = _weighted(_lanes(leaf), number, 1)
         total = found if total is None else total + found
     return total
 

@@ -8,7 +8,33 @@
 #include <string.h>
 
 #define GOOD INT64_MIN
+#define LINE 64 /* bytes of a cache line */
 #define AHEAD 8 /* rows whose donors are fetched before they are needed */
+
+/* Fetches memory that is needed soon. */
+static void fetch(const char *from, int64_t bytes)
+{
+    for (int64_t i = 0; i < bytes; i += LINE)
+        __builtin_prefetch(from + i);
+}
+
+/* The sum of numbers with weights; integers wrap around. */
+static uint64_t weighted(const int32_t *value, const int64_t *weight, int64_t width)
+{
+    uint64_t sum = 0;
+    for (int64_t c = 0; c < width; c++)
+        sum += (uint64_t)(int64_t)value[c] * (uint64_t)weight[c];
+    return sum;
+}
+
+/* _fingerprints.state_hash: the hash of one leaf of each row. */
+int64_t row_sums(int64_t rows, int64_t width, const int32_t *values,
+                 const int64_t *weights, int64_t *sums)
+{
+    for (int64_t r = 0; r < rows; r++)
+        sums[r] = (int64_t)weighted(values + r * width, weights, width);
+    return GOOD;
+}
 
 /* _fingerprints.matches: which rows have the states of their fingerprints. */
 int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
@@ -21,15 +47,14 @@ int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
         uint64_t left;
         if (place < 0 || place >= length)
             return place;
+        if (places && r + AHEAD < rows && places[r + AHEAD] >= 0
+            && places[r + AHEAD] < length)
+            for (int64_t l = 0; l < leaves; l++)
+                fetch((const char *)(values[l] + places[r + AHEAD] * widths[l]),
+                      widths[l] * (int64_t)sizeof(int32_t));
         left = (uint64_t)known[place];
-        for (int64_t l = 0; l < leaves; l++) {
-            const int32_t *value = values[l] + place * widths[l];
-            const int64_t *weight = weights[l];
-            uint64_t sum = 0;
-            for (int64_t c = 0; c < widths[l]; c++)
-                sum += (uint64_t)(int64_t)value[c] * (uint64_t)weight[c];
-            left -= sum;
-        }
+        for (int64_t l = 0; l < leaves; l++)
+            left -= weighted(values[l] + place * widths[l], weights[l], widths[l]);
         valid[r] = ((int64_t)left >> 32) == upper;
     }
     return GOOD;
@@ -164,8 +189,9 @@ int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities
             int64_t later = (c + AHEAD) * entities;
             for (int64_t i = 0; i < runs; i++)
                 if (swapped[later + run_entity[i]])
-                    __builtin_prefetch(source + run_start[i]
-                                       + donors[later + run_entity[i]] * row_bytes);
+                    fetch(source + run_start[i]
+                              + donors[later + run_entity[i]] * row_bytes,
+                          run_bytes[i]);
         }
         for (int64_t i = 0; i < runs; i++) {
             int64_t entity = run_entity[i];

@@ -35,6 +35,7 @@ __all__ = [
     "is_native_source",
     "only_torch",
     "read_columns",
+    "row_sums",
     "state_matches",
     "swap_rows",
 ]
@@ -128,6 +129,27 @@ def is_native_source(*tensors: torch.Tensor) -> bool:
         and not x.requires_grad
         for x in tensors
     )
+
+
+def row_sums(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """Returns the sums of the bits of float32 numbers with weights.
+
+    Args:
+        values (torch.Tensor): float32 ``[B, L]``.
+        weights (torch.Tensor): int64 ``[L]``.
+
+    Returns:
+        torch.Tensor: int64 ``[B]``.
+    """
+    sums = torch.empty(len(values), dtype=torch.int64)
+    _call(
+        "row_sums",
+        *values.shape,
+        values.data_ptr(),
+        weights.data_ptr(),
+        sums.data_ptr(),
+    )
+    return sums
 
 
 def state_matches(
@@ -421,6 +443,7 @@ def _call_with_rows(name: str, length: int, *args: Any) -> None:
 
 _P, _I = ctypes.c_void_p, ctypes.c_int64
 _ARGUMENTS: dict[str, list[Any]] = {
+    "row_sums": [_I, _I, _P, _P, _P],
     "state_matches": [_I, _I, _P, _I, _P, _P, _P, _P, _I, _P],
     "batch_donors": [*[_I] * 4, *[_P] * 3, ctypes.c_float, *[_P] * 5],
     "buffer_donors": [_I, _I, *[_P] * 3, ctypes.c_float, *[_P] * 3, _I, _I, *[_P] * 4],
