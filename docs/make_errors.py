@@ -19,7 +19,10 @@ STEPS = {
     "Trajectories": ("trajectories",),
     "World models": ("modules", "fit", "_fit", "_torchrl", "checkpoint"),
     "Scores and thresholds": ("influence", "evaluation", "_fingerprints"),
-    "Sampling": ("transforms", "caiac_buffer", "_buffer_transform", "_random"),
+    "Sampling": (
+        *("transforms", "caiac_buffer", "_buffer_transform", "_random"),
+        "_sampling",
+    ),
     "Training": ("objectives",),
     "Command line and reports": (
         *("cli", "report", "scored", "inspection", "plotting"),
