@@ -462,7 +462,7 @@ def _library() -> dict[str, Callable[..., Any]] | None:
     try:
         library = _load()
     except (OSError, subprocess.SubprocessError) as error:
-        _logger.info(
+        _logger.warning(
             "sampling is slower, as its functions in C are not compiled: %s. Install a "
             "C compiler (apt-get install gcc), or name one in the environment "
             "variable CC",

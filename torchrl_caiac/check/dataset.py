@@ -22,7 +22,7 @@ from torchrl_caiac.check.grouping import check_grouping
 from torchrl_caiac.check.kinds import finding
 from torchrl_caiac.check.motion import check_jumps, check_motion
 from torchrl_caiac.check.regression import Regression
-from torchrl_caiac.check.report import DatasetReport, Finding
+from torchrl_caiac.check.report import DatasetError, DatasetReport, Finding
 from torchrl_caiac.check.sample import Sample, take_sample
 from torchrl_caiac.check.state import States, read_states
 from torchrl_caiac.check.succession import Succession, check_succession
@@ -51,6 +51,8 @@ _MISLEADING = {
     "rows_out_of_order",
 }
 _BREAKS = {"end_missing", "next_not_following"}
+# Errors of swaps alone, which refuse such data.
+_LATER = {"goals_not_mapped"}
 # Warnings that this process has logged.
 _LOGGED: set[tuple[Any, ...]] = set()
 
@@ -167,7 +169,8 @@ def check_before_use(
 ) -> None:
     """Checks a sample of a dataset before something costly is done with it.
 
-    Warnings are logged, each once in a process for data with the same layout.
+    Warnings are logged, each once in a process for data with the same layout. So are
+    goals that the layout does not name: they matter to swaps, which refuse them.
 
     Args:
         data (TensorDictBase or ReplayBuffer): the transitions ``[T]``.
@@ -190,8 +193,9 @@ def check_before_use(
         torchrl_caiac.check.report.DatasetError: checked 5 of 5 transitions, ...
     """
     report = check_dataset(data, layout, **{"max_rows": _QUICK_ROWS, **kwargs})
-    report.raise_if_errors()
-    for found in report.warnings:
+    if {found.code for found in report.errors} - _LATER:
+        raise DatasetError(report)
+    for found in report.findings:
         kind = (layout, found.code, found.key, found.columns)
         if kind not in _LOGGED:
             _LOGGED.add(kind)
