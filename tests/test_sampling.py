@@ -26,6 +26,7 @@ from torchrl_caiac._sampling import (
 from torchrl_caiac.transforms import HindsightGoal
 from torchrl_caiac.transforms.draws import (
     DonorIndex,
+    SwapDraw,
     draw_batch_donors,
     draw_buffer_donors,
 )
@@ -364,3 +365,22 @@ def test_without_a_compiler(
         assert not is_native_anew()
     assert message in caplog.text
     assert ("apt-get install gcc" in caplog.text) == bool(message)
+
+
+def test_draws_that_do_not_fit_are_left_to_torch() -> None:
+    layout = EntityLayout({"a": [0], "b": [1]})
+    state = torch.zeros(3, 2)
+    td = TensorDict({"observation": state, ("next", "observation"): state}, [3])
+    plan, values = SwapPlanner(layout)(td)
+
+    def swap(rows: int, entities: int, sources: Any = None) -> Any:
+        donors = torch.zeros(rows, entities, dtype=torch.int64)
+        draw = SwapDraw(donors, donors.bool(), donors[0])
+        return apply_swap(td, plan, values, draw, sources=sources)
+
+    assert torch.equal(swap(3, 2)["observation"], state)
+    for wrong in ((3, 1), (4, 2)):
+        with pytest.raises((RuntimeError, IndexError)):
+            swap(*wrong)
+    wider = swap(3, 2, [state.double(), state.double()])
+    assert torch.equal(wider["observation"], state)

@@ -170,13 +170,18 @@ def _matched(
 ) -> torch.Tensor | None:
     """Returns what :func:`matches` does, in C; ``None`` if these data need torch."""
     known = known.as_subclass(torch.Tensor)
-    if not is_native_source(known) or not is_native(known if rows is None else rows):
+    numbers = (known,) if rows is None else (known, rows)
+    if any(x.dtype is not torch.int64 or x.ndim != 1 for x in numbers):
+        return None
+    if not is_native_source(known) or not is_native(numbers[-1]):
         return None
     leaves, weights = [], []
     for entries, factor in ((keys, 1), (next_keys, _NEXT)):
         for number, leaf in enumerate(state_leaves(td, entries)):
             leaf = leaf.as_subclass(torch.Tensor)
             if leaf.dtype is not torch.float32 or leaf.ndim != 2:
+                return None
+            if len(leaf) < len(known):
                 return None
             leaves.append(leaf)
             weights.append(_weights(leaf.shape[1], number, factor, leaf.device))

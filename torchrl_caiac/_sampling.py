@@ -58,11 +58,13 @@ class Runs(NamedTuple):
         entity (torch.Tensor): the entity of each run of bytes, int64 ``[R]``.
         start (torch.Tensor): its first byte in the row, int64 ``[R]``.
         length (torch.Tensor): its bytes, int64 ``[R]``.
+        last (int): the highest entity, -1 if there is none.
     """
 
     entity: torch.Tensor
     start: torch.Tensor
     length: torch.Tensor
+    last: int
 
     @classmethod
     def of(cls, owners: Sequence[int], itemsize: int) -> Runs:
@@ -82,7 +84,8 @@ class Runs(NamedTuple):
             else:
                 runs.append([owner, column * itemsize, itemsize])
         table = torch.tensor(runs, dtype=torch.int64).reshape(-1, 3)
-        return cls(*(x.contiguous() for x in table.unbind(1)))
+        entity, start, length = table.t().contiguous().unbind()
+        return cls(entity, start, length, max(owners, default=-1))
 
 
 @contextmanager
@@ -368,7 +371,8 @@ def _column_runs(columns: tuple[int, ...], itemsize: int) -> Runs:
             runs[-1][2] += itemsize
         else:
             runs.append([0, column * itemsize, itemsize])
-    return Runs(*torch.tensor(runs).t().contiguous())
+    entity, start, length = torch.tensor(runs).t().contiguous().unbind()
+    return Runs(entity, start, length, 0)
 
 
 def swap_rows(

@@ -352,6 +352,7 @@ def draw_buffer_donors(
     device = free.device
     if (
         isinstance(index, DonorIndex)
+        and index.starts.dtype in (torch.int32, torch.int64)
         and is_native_source(*index)
         and is_native(free, *(() if chosen is None else (chosen,)))
     ):

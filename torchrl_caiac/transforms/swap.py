@@ -432,9 +432,19 @@ def _swapped(
     own = [values[leaf.place] for leaf in plan.leaves]
     found = own if sources is None else sources
     donors, swapped = draw.donors.contiguous(), draw.swapped.contiguous()
-    if not is_native(donors, swapped, *own) or donors.dtype is not torch.int64:
+    if not is_native(donors, swapped, *own) or not is_native_source(*found):
         return None
-    if sources is not None and not is_native_source(*sources):
+    is_as_drawn = (
+        (donors.dtype, swapped.dtype) == (torch.int64, torch.bool)
+        and donors.shape == swapped.shape
+        and all(leaf.runs.last < swapped.shape[1] for leaf in plan.leaves)
+        and all(len(value) >= len(swapped) * window for value in own)
+        and all(
+            (value.dtype, value.shape[1:]) == (source.dtype, source.shape[1:])
+            for value, source in zip(own, found, strict=True)
+        )
+    )
+    if not is_as_drawn:  # the operations of torch say what is wrong
         return None
     return {
         leaf.key: swap_rows(value, source, leaf.runs, donors, swapped, window)

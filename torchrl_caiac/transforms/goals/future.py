@@ -317,9 +317,9 @@ class FutureGoal(RandomTransform, SampleUnit):
         layout = self.layout
         if layout.is_flat:
             source, where = self.flat_source(data)
-            if is_native_source(source) and is_native(
-                *(source,) if rows is None else (rows,)
-            ):
+            numbers = source if rows is None else rows
+            is_vector = rows is None or (rows.ndim, rows.dtype) == (1, torch.int64)
+            if is_vector and is_native_source(source) and is_native(numbers):
                 goals = read_columns(source, self._goal_columns[1], rows)
             elif rows is None:
                 goals = source.gather(1, where.expand(source.shape[0], -1))

@@ -272,7 +272,7 @@ class HindsightGoal(FutureGoal):
             dtype=torch.float64,
         )
         shares = self.future, self.random, self.counterfactual
-        if is_native(flags, chance, pick):
+        if flags.dtype is torch.bool and is_native(flags, chance, pick):
             return HindsightDraw(
                 hindsight_sources(flags, chance, pick, *shares), future
             )
