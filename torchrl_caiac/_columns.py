@@ -136,8 +136,8 @@ def check_goal_names(
         missing = [name for name in names if name not in goal and name not in fixed]
         if missing:
             raise ValueError(
-                f"goal lacks {missing}: name the goal of every entity that is not "
-                f"fixed, and give {nothing} to an entity without a goal"
+                f"goal lacks {missing}: name the robot in fixed, and give the goal of "
+                f"every other entity, {nothing} (in a file []) if it has none"
             )
     if achieved is not None:
         if goal is None:

@@ -99,3 +99,27 @@ def test_linked_objects_may_be_two_entities() -> None:
         data[key] = torch.cat([data[key], lid], 1)
     report = check_dataset(data, layout_of({**ENTITIES, "lid": range(10, 13)}))
     assert "moves_with_other" not in {f.code for f in report.findings}
+
+
+def test_goals_without_a_layout_hide_nothing() -> None:
+    shifted = {"robot": range(0, 5), "left": range(5, 8), "right": range(8, 10)}
+    report = check_dataset(objects(colour=False), layout_of(shifted))
+    assert [f.code for f in report.errors] == ["goals_not_mapped"]
+    assert "moves_with_other" in {f.code for f in report.warnings}
+
+
+def test_goals_of_another_width_hide_nothing() -> None:
+    columns = {"robot": range(4), "left": range(4, 7)}
+    goals = {"goal": {"left": [0, 1]}, "achieved": {"left": [4, 5]}}
+    layout = EntityLayout(columns, fixed=["robot"], **goals)
+    report = check_dataset(objects(colour=False), layout)
+    assert {f.code for f in report.errors} == {"wrong_shape"}
+    assert "unowned_columns_move" in {f.code for f in report.warnings}
+
+
+def test_a_robot_that_is_not_fixed() -> None:
+    data = clean().exclude(*GOALS)
+    for fixed in (["left"], []):
+        report = check_dataset(data, EntityLayout(ENTITIES, fixed=fixed))
+        codes = {f.code for f in report.findings}
+        assert "robot_not_fixed" in codes and "always_moves" not in codes

@@ -231,6 +231,7 @@ class _Check:
         self.data, self.newest = _rows(data)
         self.floors: dict[str, dict[int, float]] | None = None
         self.findings: list[Finding] = []
+        self.has_bad_goals = False
 
     def run(self, max_rows: int) -> DatasetReport:
         """Runs all checks that the entries of the data allow."""
@@ -242,8 +243,12 @@ class _Check:
             reward_key=self.reward_key,
             read_next=self.read_next,
         )
-        bad = {found.key for found in self.findings}
-        complete = all(found.severity == "warning" for found in self.findings)
+        bad = {found.key for found in self.findings if found.severity == "error"}
+        # Errors of goals do not hide what is wrong with the state.
+        goals = {x for key in _goal_keys(layout) for x in (key, layout.next(key))}
+        self.has_bad_goals = bool(bad & goals)
+        bad -= goals
+        complete = not bad
         ends = check_end_entries(data, self.trajectory_key, self.done_key)
         self.findings += ends
         index = self._index(ends)
@@ -319,7 +324,12 @@ class _Check:
             if not {found.code for found in links.findings} & _MISLEADING:
                 whole = ~links.broken
                 chosen = sample.keep(whole), states.keep(whole)
-                found = check_motion(*chosen, layout.fixed, self.floors)
+                found = check_motion(
+                    *chosen,
+                    layout.fixed,
+                    self.floors,
+                    None if action is None else action[good][whole],
+                )
                 found += check_jumps(*chosen)
                 self.findings += found
             still = {
@@ -336,7 +346,8 @@ class _Check:
         self.findings += check_columns(
             layout, sample, states, regression, unowned, still
         )
-        self.findings += check_goals(layout, sample, data)
+        if not self.has_bad_goals:
+            self.findings += check_goals(layout, sample, data)
         if whole is not None:
             known = {
                 column
@@ -438,6 +449,12 @@ class _Check:
             name: {position: next(values) for position in own}
             for name, own in positions.items()
         }
+
+
+def _goal_keys(layout: EntityLayout) -> list[NestedKey]:
+    """Returns the keys of goals, whether the layout maps them or not."""
+    keys = [layout.desired_goal_key, layout.achieved_goal_key]
+    return [*goal_entries(layout), *(key for key in keys if key is not None)]
 
 
 def _key(key: NestedKey | None) -> NestedKey | None:

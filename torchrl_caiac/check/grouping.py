@@ -75,7 +75,7 @@ def check_grouping(
         if states.labels[c] not in explained
     }
     if misplaced:
-        message = "columns that move with another entity, not with their own: " + named(
+        message = "columns that move with another entity than their own: " + named(
             [f"{label} with {other!r}" for label, other in misplaced.items()]
         )
         findings.append(finding("moves_with_other", message, columns=list(misplaced)))

@@ -194,7 +194,7 @@ KINDS: dict[str, Kind] = {
     "goal_not_mirrored": Kind(
         "error",
         "after a swap goals and rewards do not agree with the state",
-        "correct achieved= of the layout, or the achieved goals of the data",
+        "correct goal or achieved of the layout, or the achieved goals of the data",
     ),
     # --- motion ----------------------------------------------------------------------
     "never_moves": Kind(
@@ -208,6 +208,12 @@ KINDS: dict[str, Kind] = {
         "the robot is swapped like an object, so that counterfactuals have it in "
         "places where it does not touch what it holds",
         "name the robot in fixed, unless the layout leaves it out",
+    ),
+    "robot_not_fixed": Kind(
+        "warning",
+        "a robot is swapped like an object, so that the actions of counterfactuals do "
+        "not fit their states",
+        "name it in fixed",
     ),
     "always_moves": Kind(
         "warning",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from torchrl_caiac._column_motion import explained_shares
 from torchrl_caiac.check.kinds import finding
 from torchrl_caiac.check.report import Finding
 from torchrl_caiac.check.sample import Sample
@@ -17,6 +18,7 @@ from torchrl_caiac.check.values import named
 __all__ = ["check_jumps", "check_motion"]
 
 _ALWAYS = 0.99  # of the rows
+_EXPLAINED = 0.6  # share of the variance of a robot's motion, as in inspect_dataset
 _REST = 0.01  # of a large change: smaller ones do not count as motion
 _LARGE = 0.1  # of a large change: the rows in which the entity moves for sure
 _NEGLIGIBLE = 1e-5  # of the largest deviation of a column: the jitter of a simulator
@@ -34,6 +36,7 @@ def check_motion(
     states: States,
     fixed: Collection[str],
     floors: Mapping[str, Mapping[int, float]] | None,
+    action: torch.Tensor | None = None,
 ) -> list[Finding]:
     """Finds entities that never or always move, and floors in other units.
 
@@ -43,6 +46,7 @@ def check_motion(
         fixed (collection of str): entities that are never swapped.
         floors (mapping, optional): for each predicted entity the variance floor of its
             predicted columns, by position in the entity.
+        action (torch.Tensor, optional): the actions, ``[n, A]``.
 
     Returns:
         list of Finding: what was found.
@@ -75,12 +79,26 @@ def check_motion(
         if name in still:
             continue
         labels = states.labels[states.slices[name]]
-        if motion.share >= _ALWAYS and name not in fixed and len(sample) >= 100:
+        always = motion.share >= _ALWAYS and name not in fixed and len(sample) >= 100
+        if always and _moves_with(action, states, states.slices[name]):
+            message = f"{name!r} moves with the action, but is not fixed"
+            findings.append(finding("robot_not_fixed", message, columns=labels))
+        elif always:
             message = f"{name!r} moves in {motion.share:.1%} of the checked rows"
             findings.append(finding("always_moves", message, columns=labels))
         if motion.floor:
             findings += _check_floor(name, motion)
     return findings
+
+
+def _moves_with(action: torch.Tensor | None, states: States, where: slice) -> bool:
+    """Returns whether the action explains the motion of half of the columns."""
+    if action is None:
+        return False
+    change = (states.next[:, where] - states.now[:, where]).double()
+    moves = (change != 0).any(0)
+    shares = explained_shares(change[:, moves], action.double())
+    return bool((shares >= _EXPLAINED).double().mean() >= 0.5)
 
 
 @dataclass(frozen=True)

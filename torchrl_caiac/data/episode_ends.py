@@ -97,7 +97,7 @@ def find_episode_ends(
         _check_agree(names[0], first, name, first ^ ends[name])
     if not ends and terminated is None and truncated is None:
         raise ValueError(
-            "nothing says where the episodes end: give terminals and timeouts (with "
+            "nothing says where the episodes end: give terminals or timeouts (with "
             f"one flag for each of the {steps} actions), episode_lengths or "
             f"episode_ids; episode_lengths=[{steps}] if all rows are one episode"
         )
