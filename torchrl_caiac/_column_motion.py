@@ -5,12 +5,15 @@ from __future__ import annotations
 import torch
 
 __all__ = [
+    "EXPLAINED_BY_ACTION",
     "explained_shares",
     "motion_correlations",
     "moving_columns",
     "position_columns",
 ]
 
+#: The share of a robot's motion that the action explains, at least.
+EXPLAINED_BY_ACTION = 0.6
 _VELOCITY = 0.9  # correlation of a position's change with its velocity
 _MOVES = 1e-3  # of a column's range: a change above it counts as motion
 _JITTER = 5e-3  # of the median range: a column with a smaller one does not move

@@ -27,6 +27,7 @@ from torchrl_caiac._files import UnreadableFileError, read_json, write_json
 
 __all__ = [
     "UsedKernels",
+    "cache_folder",
     "check_kernels",
     "choose",
     "keep_kernels",
@@ -320,15 +321,27 @@ def processor_slug(name: str) -> str:
     return re.sub("[^a-z0-9]+", "_", name.lower()).strip("_") or "unknown"
 
 
+def cache_folder() -> Path | None:
+    """Returns the folder of what is kept for later processes, ``None`` without a home.
+
+    Examples:
+        >>> from torchrl_caiac._kernels import cache_folder
+        >>> cache_folder().name
+        'torchrl_caiac'
+    """
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(folder, "torchrl_caiac") if os.path.isabs(folder) else None
+
+
 def _cache_file() -> Path | None:
     """Returns the file of this processor's choices, ``None`` without a home."""
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    if not os.path.isabs(folder):
+    folder = cache_folder()
+    if folder is None:
         return None
     own = machine()
     digest = hashlib.sha256(json.dumps(own).encode()).hexdigest()[:12]
     slug = processor_slug(own["processor"])
-    return Path(folder, "torchrl_caiac", f"linear-{slug}-{digest}.json")
+    return folder / f"linear-{slug}-{digest}.json"
 
 
 def _stored(file: Path | None) -> dict[str, str]:

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._column_motion import (
+    EXPLAINED_BY_ACTION,
     explained_shares,
     motion_correlations,
     moving_columns,
@@ -29,7 +30,6 @@ __all__ = [
 ]
 
 _ALWAYS = 0.5  # share of rows in which a column of the robot moves
-_EXPLAINED = 0.6  # share of a change's variance that the action explains, in the robot
 _TOGETHER = 0.5  # correlation of columns of one entity, next to each other
 _APART = 0.7  # the same, of columns that are not next to each other
 _TENTHS = 10
@@ -129,7 +129,7 @@ class MovingColumns:
     @property
     def is_robot(self) -> torch.Tensor:
         """Which columns move almost always, or with the action, bool ``[D]``."""
-        often = (self.moves >= _ALWAYS) | (self.explained >= _EXPLAINED)
+        often = (self.moves >= _ALWAYS) | (self.explained >= EXPLAINED_BY_ACTION)
         return often & self.moving.any(0)
 
     def facts(self) -> list[ColumnFacts]:

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchrl_caiac._kernels import machine, processor_slug
+from torchrl_caiac._kernels import cache_folder, machine, processor_slug
+from torchrl_caiac._whole_files import whole_file
 
 __all__ = [
     "Runs",
@@ -75,17 +76,21 @@ class Runs(NamedTuple):
             >>> Runs.of([0, 0, -1, 1], itemsize=4).start
             tensor([ 0, 12])
         """
+        pairs = [(owner, c) for c, owner in enumerate(owners) if owner >= 0]
+        return cls.of_columns(pairs, itemsize)
+
+    @classmethod
+    def of_columns(cls, pairs: Sequence[tuple[int, int]], itemsize: int) -> Runs:
+        """Returns the runs of pairs of an entity and one of its columns."""
         runs: list[list[int]] = []
-        for column, owner in enumerate(owners):
-            if owner < 0:
-                continue
+        for owner, column in pairs:
             if runs and runs[-1][0] == owner and sum(runs[-1][1:]) == column * itemsize:
                 runs[-1][2] += itemsize
             else:
                 runs.append([owner, column * itemsize, itemsize])
         table = torch.tensor(runs, dtype=torch.int64).reshape(-1, 3)
         entity, start, length = table.t().contiguous().unbind()
-        return cls(entity, start, length, max(owners, default=-1))
+        return cls(entity, start, length, max((n for n, _ in pairs), default=-1))
 
 
 @contextmanager
@@ -148,9 +153,9 @@ def row_sums(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     _call(
         "row_sums",
         *values.shape,
-        values.data_ptr(),
-        weights.data_ptr(),
-        sums.data_ptr(),
+        values,
+        weights,
+        sums,
     )
     return sums
 
@@ -183,14 +188,14 @@ def state_matches(
         len(known),
         count,
         len(known),
-        0 if rows is None else rows.data_ptr(),
+        rows,
         len(leaves),
-        _pointers(leaves),
+        _array(leaves),
         (ctypes.c_int64 * len(leaves))(*(leaf.shape[1] for leaf in leaves)),
-        _pointers(weights),
-        known.data_ptr(),
+        _array(weights),
+        known,
         upper,
-        valid.data_ptr(),
+        valid,
     )
     return valid
 
@@ -222,9 +227,7 @@ def batch_donors(
         without a donor int64 ``[N]``.
     """
     count, entities = free.shape
-    donors = torch.empty(drawn, entities, dtype=torch.int64)
-    swapped = torch.empty(drawn, entities, dtype=torch.bool)
-    no_donor = torch.empty(entities, dtype=torch.int64)
+    found = _empty_draw(drawn, entities)
     listed = torch.empty(count, dtype=torch.int64)
     _call(
         "batch_donors",
@@ -232,17 +235,15 @@ def batch_donors(
         count - drawn,
         entities,
         window,
-        free.data_ptr(),
-        0 if chosen is None else chosen.data_ptr(),
-        0 if chance is None else chance.data_ptr(),
+        free,
+        chosen,
+        chance,
         swap_prob,
-        share.data_ptr(),
-        listed.data_ptr(),
-        donors.data_ptr(),
-        swapped.data_ptr(),
-        no_donor.data_ptr(),
+        share,
+        listed,
+        *found,
     )
-    return donors, swapped, no_donor
+    return found
 
 
 def buffer_donors(
@@ -271,27 +272,31 @@ def buffer_donors(
     Returns:
         tuple of torch.Tensor: as of :func:`batch_donors`.
     """
-    donors = torch.empty(free.shape, dtype=torch.int64)
-    swapped = torch.empty(free.shape, dtype=torch.bool)
-    no_donor = torch.empty(free.shape[1], dtype=torch.int64)
+    found = _empty_draw(*free.shape)
     _call(
         "buffer_donors",
         *free.shape,
-        free.data_ptr(),
-        0 if chosen is None else chosen.data_ptr(),
-        0 if chance is None else chance.data_ptr(),
+        free,
+        chosen,
+        chance,
         swap_prob,
-        share.data_ptr(),
-        offset.data_ptr(),
-        size.data_ptr(),
+        share,
+        offset,
+        size,
         len(starts),
         starts.dtype is torch.int32,
-        starts.data_ptr(),
-        donors.data_ptr(),
-        swapped.data_ptr(),
-        no_donor.data_ptr(),
+        starts,
+        *found,
     )
-    return donors, swapped, no_donor
+    return found
+
+
+def _empty_draw(
+    drawn: int, entities: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    donors = torch.empty(drawn, entities, dtype=torch.int64)
+    swapped = torch.empty(drawn, entities, dtype=torch.bool)
+    return donors, swapped, torch.empty(entities, dtype=torch.int64)
 
 
 def hindsight_sources(
@@ -319,14 +324,14 @@ def hindsight_sources(
     _call(
         "hindsight_sources",
         len(flags),
-        flags.data_ptr(),
-        chance.data_ptr(),
-        pick.data_ptr(),
+        flags,
+        chance,
+        pick,
         future,
         random,
         counterfactual,
-        order.data_ptr(),
-        source.data_ptr(),
+        order,
+        source,
     )
     return source
 
@@ -352,27 +357,20 @@ def read_columns(
         len(source),
         count,
         len(source),
-        0 if rows is None else rows.data_ptr(),
+        rows,
         source.shape[1] * source.element_size(),
         len(runs.start),
-        runs.start.data_ptr(),
-        runs.length.data_ptr(),
-        source.data_ptr(),
-        out.data_ptr(),
+        runs.start,
+        runs.length,
+        source,
+        out,
     )
     return out
 
 
 @lru_cache(maxsize=64)
 def _column_runs(columns: tuple[int, ...], itemsize: int) -> Runs:
-    runs: list[list[int]] = []
-    for column in columns:
-        if runs and sum(runs[-1][1:]) == column * itemsize:
-            runs[-1][2] += itemsize
-        else:
-            runs.append([0, column * itemsize, itemsize])
-    entity, start, length = torch.tensor(runs).t().contiguous().unbind()
-    return Runs(entity, start, length, 0)
+    return Runs.of_columns([(0, column) for column in columns], itemsize)
 
 
 def swap_rows(
@@ -407,36 +405,39 @@ def swap_rows(
         window,
         entities,
         len(source),
-        donors.data_ptr(),
-        swapped.data_ptr(),
+        donors,
+        swapped,
         own.nbytes // len(own),
         len(runs.entity),
-        runs.entity.data_ptr(),
-        runs.start.data_ptr(),
-        runs.length.data_ptr(),
-        own.data_ptr(),
-        source.data_ptr(),
-        out.data_ptr(),
+        runs.entity,
+        runs.start,
+        runs.length,
+        own,
+        source,
+        out,
     )
     return out
 
 
 def all_finite(values: torch.Tensor) -> bool:
     """Returns whether all numbers of a float32 tensor are finite."""
-    return bool(_call("all_finite", values.numel(), values.data_ptr()))
+    return bool(_call("all_finite", values.numel(), values))
 
 
 # --- the library ---------------------------------------------------------------------
 
 
-def _pointers(tensors: Sequence[torch.Tensor]) -> Any:
+def _array(tensors: Sequence[torch.Tensor]) -> Any:
     return (ctypes.c_void_p * len(tensors))(*(x.data_ptr() for x in tensors))
 
 
 def _call(name: str, *args: Any) -> Any:
+    """Calls a function; tensors are passed as the addresses of their numbers."""
     functions = _library()
     assert functions is not None  # is_native() is true
-    return functions[name](*args)
+    return functions[name](
+        *(x.data_ptr() if isinstance(x, torch.Tensor) else x for x in args)
+    )
 
 
 def _call_with_rows(name: str, length: int, *args: Any) -> None:
@@ -493,14 +494,14 @@ def _load() -> ctypes.CDLL:
     key = _SOURCE.read_bytes() + json.dumps(own).encode()
     slug = processor_slug(str(own["processor"]))
     name = f"sampling-{slug}-{hashlib.sha256(key).hexdigest()[:12]}.so"
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    file = Path(folder, "torchrl_caiac", name)
-    if _is_mine(file):
+    folder = cache_folder()
+    file = None if folder is None else folder / name
+    if file is not None and _is_mine(file):
         try:
             return ctypes.CDLL(str(file))
         except OSError as error:  # damaged
             _logger.debug("%s is compiled again: %s", file, error)
-    with tempfile.TemporaryDirectory(dir=_folder(file.parent)) as work:
+    with tempfile.TemporaryDirectory() as work:
         made = Path(work, name)
         subprocess.run(
             [compiler, *_FLAGS, str(_SOURCE), "-o", str(made)],
@@ -508,25 +509,25 @@ def _load() -> ctypes.CDLL:
             capture_output=True,
             timeout=_SECONDS,
         )
-        library = ctypes.CDLL(str(made))
-        if made.parent.parent == file.parent:
-            made.chmod(0o700)
-            made.replace(file)  # for the next process
-    return library  # it stays loaded without its file
+        # It stays loaded without its file.
+        return ctypes.CDLL(str(made if file is None else _kept(made, file)))
 
 
 def _is_mine(file: Path) -> bool:
     """Returns whether this user alone can have written a file."""
-    if not file.is_absolute() or not file.is_file():
+    if not file.is_file():
         return False
     status = file.stat()
     return status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
-def _folder(wanted: Path) -> Path | None:
-    """Returns a folder to compile in; ``None``, the one of the system, if need be."""
+def _kept(made: Path, file: Path) -> Path:
+    """Copies a file for the next process; returns the one to load."""
     try:
-        wanted.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    return wanted if wanted.is_absolute() and os.access(wanted, os.W_OK) else None
+        with whole_file(file) as partial:
+            shutil.copyfile(made, partial)
+            partial.chmod(0o700)
+    except OSError as error:
+        _logger.debug("%s is not kept: %s", file, error)
+        return made
+    return file

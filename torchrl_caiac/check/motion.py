@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchrl_caiac._column_motion import explained_shares
+from torchrl_caiac._column_motion import EXPLAINED_BY_ACTION, explained_shares
 from torchrl_caiac.check.kinds import finding
 from torchrl_caiac.check.report import Finding
 from torchrl_caiac.check.sample import Sample
@@ -18,7 +18,6 @@ from torchrl_caiac.check.values import named
 __all__ = ["check_jumps", "check_motion"]
 
 _ALWAYS = 0.99  # of the rows
-_EXPLAINED = 0.6  # share of the variance of a robot's motion, as in inspect_dataset
 _REST = 0.01  # of a large change: smaller ones do not count as motion
 _LARGE = 0.1  # of a large change: the rows in which the entity moves for sure
 _NEGLIGIBLE = 1e-5  # of the largest deviation of a column: the jitter of a simulator
@@ -98,7 +97,7 @@ def _moves_with(action: torch.Tensor | None, states: States, where: slice) -> bo
     change = (states.next[:, where] - states.now[:, where]).double()
     moves = (change != 0).any(0)
     shares = explained_shares(change[:, moves], action.double())
-    return bool((shares >= _EXPLAINED).double().mean() >= 0.5)
+    return bool((shares >= EXPLAINED_BY_ACTION).double().mean() >= 0.5)
 
 
 @dataclass(frozen=True)

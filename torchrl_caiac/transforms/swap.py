@@ -221,7 +221,8 @@ class SwapPlanner:
                 )
             if source.is_swapped:
                 entity = source.entity
-                runs = Runs.of([entity], value[:1].nbytes)
+                size = value.shape[1:].numel() * value.element_size()
+                runs = Runs.of([entity], size)
                 leaves.append(
                     SwapLeaf(key, place, entity, 1, entity, source.is_desired, runs)
                 )
