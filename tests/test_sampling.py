@@ -226,7 +226,7 @@ def test_columns_of_rows(
     assert torch.equal(found, wanted[:, columns])
 
 
-@pytest.mark.parametrize("row", [-1, -2, 3, 1 << 40])
+@pytest.mark.parametrize("row", [-1, -2, 3, 1 << 40, (1 << 63) - 1, -(1 << 63)])
 def test_rows_out_of_range(row: int) -> None:
     state, rows = torch.zeros(3, 2), torch.tensor([0, row])
     with pytest.raises(IndexError, match=f"row {row} is out of range: there are 3"):
@@ -406,3 +406,44 @@ def test_plans_of_an_empty_batch_fit_later_ones() -> None:
     in_c, in_torch = both(lambda: apply_swap(td, *planner(td), draw))
     for batch in (in_c, in_torch):
         assert torch.equal(batch["a"], state[[1, 1]])
+
+
+def test_lazy_signs_and_tensors_without_memory_need_torch() -> None:
+    number = torch.complex(torch.ones(2, 2), torch.ones(2, 2)).conj()
+    assert number.is_contiguous() and not is_native(number)
+    assert not is_native(torch._neg_view(torch.ones(2, 2)))
+    assert not is_native(torch._efficientzerotensor((2, 2)))
+    assert is_native(torch.ones(0, 2))
+
+
+def test_numbers_of_other_types_and_an_empty_index_need_torch() -> None:
+    free = torch.tensor([[1], [1], [0], [1]])
+    one, other = both(lambda: draw_batch_donors(free.bool(), 4).swapped)
+    assert torch.equal(one, other)
+    assert torch.equal(draw_batch_donors(free, 4).swapped.bool(), one)
+    short = DonorIndex(
+        torch.arange(4), torch.tensor([0, 2]).int(), torch.tensor([2, 2]).int()
+    )
+    whole = torch.ones(9, 2, dtype=torch.bool)
+    donors = draw_buffer_donors(whole, short).donors
+    assert (donors[:, 0] < 2).all() and (donors[:, 1] >= 2).all()
+    nothing = torch.zeros(0, dtype=torch.int64)
+    zero = torch.tensor([0, 0])
+    with pytest.raises(IndexError):
+        draw_buffer_donors(whole, DonorIndex(nothing, zero, zero))
+
+
+@pytest.mark.parametrize("window", [1, 2])
+def test_leaves_without_columns(window: int) -> None:
+    layout = EntityLayout.from_keys({"a": "a", "b": "b"})
+    none, state = torch.zeros(4, 0), torch.arange(8.0).view(4, 2)
+    parts = {"a": none, "b": state}
+    td = TensorDict({**parts, "next": parts}, [4])
+    plan, values = SwapPlanner(layout)(td)
+    sources = [values[leaf.place] for leaf in plan.leaves]
+    one = torch.ones(4 // window, 2)
+    draw = SwapDraw(one.long() * 0, one.bool(), torch.zeros(2))
+    for batch in both(
+        lambda: apply_swap(td, plan, values, draw, window=window, sources=sources)
+    ):
+        assert torch.equal(batch["b"], state[:window].repeat(4 // window, 1))

@@ -1,13 +1,13 @@
 /* What sampling does to each row, without one operation of torch after the other.
  *
  * Each function gives the numbers of its reference in Python, to the bit; see
- * _sampling.py. All tensors are contiguous and on the CPU. Each returns the
- * first row that is out of range, or GOOD.
+ * _sampling.py. All tensors are contiguous and on the CPU. A function that
+ * is given rows returns the place of the first one that is out of range, or GOOD.
  */
 #include <stdint.h>
 #include <string.h>
 
-#define GOOD INT64_MIN
+#define GOOD -1
 #define LINE 64 /* bytes of a cache line */
 #define AHEAD 8 /* rows whose donors are fetched before they are needed */
 
@@ -46,7 +46,7 @@ int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
         int64_t place = places ? places[r] : r;
         uint64_t left;
         if (place < 0 || place >= length)
-            return place;
+            return r;
         if (places && r + AHEAD < rows && places[r + AHEAD] >= 0
             && places[r + AHEAD] < length)
             for (int64_t l = 0; l < leaves; l++)
@@ -161,7 +161,7 @@ int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
         int64_t place = places ? places[r] : r;
         const char *from = source + place * row_bytes;
         if (place < 0 || place >= length)
-            return place;
+            return r;
         if (places && r + AHEAD < rows)
             __builtin_prefetch(source + places[r + AHEAD] * row_bytes + run_start[0]);
         for (int64_t i = 0; i < runs; i++) {
@@ -200,8 +200,8 @@ int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities
             int64_t donor = donors[c * entities + entity];
             const char *from = source + donor * row_bytes;
             char *to = out + c * window * row_bytes;
-            if (donor < 0 || donor + window > length)
-                return donor;
+            if (donor < 0 || donor > length - window)
+                return c * entities + entity;
             for (int64_t w = 0; w < window; w++)
                 memcpy(to + w * row_bytes + run_start[i],
                        from + w * row_bytes + run_start[i], (size_t)run_bytes[i]);

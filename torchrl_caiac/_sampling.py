@@ -48,7 +48,7 @@ _FLAGS = ("-O3", "-march=native", "-std=c99", "-shared", "-fPIC")
 _SECONDS = 60  # for compiling
 # Numbers of a batch from which torch, with several threads, may be faster.
 _MOST = 1 << 22
-_GOOD = -(1 << 63)  # what functions in C return if no row is out of range
+_GOOD = -1  # what functions in C return if no row is out of range
 _off: ContextVar[bool] = ContextVar("only_torch", default=False)
 
 
@@ -134,7 +134,8 @@ def is_native_source(*tensors: torch.Tensor) -> bool:
         type(x) is torch.Tensor
         and x.device.type == "cpu"
         and x.is_contiguous()
-        and not x.requires_grad
+        and not (x.requires_grad or x.is_neg() or x.is_conj())
+        and (x.data_ptr() != 0 or not x.numel())
         for x in tensors
     )
 
@@ -185,6 +186,7 @@ def state_matches(
     valid = torch.empty(count, dtype=torch.bool)
     _call_with_rows(
         "state_matches",
+        rows,
         len(known),
         count,
         len(known),
@@ -354,6 +356,7 @@ def read_columns(
     runs = _column_runs(tuple(columns), source.element_size())
     _call_with_rows(
         "read_columns",
+        rows,
         len(source),
         count,
         len(source),
@@ -399,6 +402,7 @@ def swap_rows(
     drawn, entities = swapped.shape
     _call_with_rows(
         "swap_rows",
+        donors,
         len(source),
         len(own) - drawn * window,
         drawn,
@@ -440,9 +444,12 @@ def _call(name: str, *args: Any) -> Any:
     )
 
 
-def _call_with_rows(name: str, length: int, *args: Any) -> None:
-    bad = _call(name, *args)
-    if bad != _GOOD:
+def _call_with_rows(
+    name: str, rows: torch.Tensor | None, length: int, *args: Any
+) -> None:
+    place = _call(name, *args)
+    if place != _GOOD:
+        bad = place if rows is None else int(rows.flatten()[place])
         raise IndexError(f"row {bad} is out of range: there are {length} rows")
 
 

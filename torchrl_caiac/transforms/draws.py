@@ -232,6 +232,16 @@ def _drawn(
     return free & (_chance(free, generator) < swap_prob)
 
 
+def _is_native_draw(
+    free: torch.Tensor, chosen: torch.Tensor | None, drawn: int
+) -> bool:
+    """Returns whether a draw is computed in C."""
+    if chosen is None:
+        return free.dtype is torch.bool and is_native(free)
+    is_fit = (chosen.dtype, chosen.shape) == (torch.bool, (drawn,))
+    return is_fit and free.dtype is torch.bool and is_native(free, chosen)
+
+
 def _chance(free: torch.Tensor, generator: torch.Generator | None) -> torch.Tensor:
     return draw_numbers(
         torch.rand,
@@ -282,7 +292,7 @@ def draw_batch_donors(
     """
     count, entities = free.shape
     first = count - num_windows
-    if num_windows and is_native(free, *(() if chosen is None else (chosen,))):
+    if num_windows and _is_native_draw(free, chosen, num_windows):
         chance = None if swap_prob >= 1.0 else _chance(free[first:].t(), generator)
         share = draw_numbers(
             torch.rand,
@@ -352,9 +362,12 @@ def draw_buffer_donors(
     device = free.device
     if (
         isinstance(index, DonorIndex)
+        and len(index.starts)
         and index.starts.dtype in (torch.int32, torch.int64)
+        and index.offset.dtype == index.size.dtype == torch.int64
+        and len(index.offset) == len(index.size) == free.shape[1]
         and is_native_source(*index)
-        and is_native(free, *(() if chosen is None else (chosen,)))
+        and _is_native_draw(free, chosen, len(free))
     ):
         chance = None if swap_prob >= 1.0 else _chance(free.t(), generator)
         share = draw_numbers(

@@ -416,7 +416,8 @@ def apply_swap(
             if kind not in masks:
                 masks[kind] = _mask(draw.swapped, leaf, value.ndim, plan.has_rest)
             tail = value[first:].unflatten(0, (changed, window))
-            new = new.to(tail.device).view(changed, -1, *tail.shape[2:])
+            each = 1 if goals is not None and leaf.is_desired else window
+            new = new.to(tail.device).view(changed, each, *tail.shape[2:])
             new = torch.where(masks[kind], new, tail).flatten(0, 1)
         leaves[leaf.key] = torch.cat([value[:first], new]) if first else new
     return with_leaves(td, leaves)
@@ -438,6 +439,7 @@ def _swapped(
     is_as_drawn = (
         (donors.dtype, swapped.dtype) == (torch.int64, torch.bool)
         and donors.shape == swapped.shape
+        and donors.ndim == 2
         and all(leaf.runs.last < swapped.shape[1] for leaf in plan.leaves)
         and all(len(value) >= len(swapped) * window for value in own)
         and all(
