@@ -5,7 +5,8 @@ actions: Fetch-Push with two cubes (34 columns and 4 actions, 3 x 256, 11 predic
 columns of 3 entities) and the kitchen (30 and 9, 5 x 256, all columns of 10 entities).
 The speed of the fast mode depends on how many states are near the threshold, so the
 states are real: a few episodes of the scripted experts and of random actions, which the
-models are fitted to first (about a minute for each).
+models are fitted to first (about a minute for each). ``outputs/benchmarks`` keeps them,
+for the next run and for machines without MuJoCo.
 
 The reference is a direct implementation of eq. 3, with all ``[B, K, K, d]`` tensors in
 memory, in float32 and for 256 states at once. In parts of 32 states, which stay in the
@@ -35,19 +36,12 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, ReplayBuffer, TensorStorage
 
+from benchmarks.bench_lmp import kitchen_layout
+from benchmarks.bench_sampling import FETCH
 from benchmarks.ratios import seconds
 from torchrl_caiac._kernels import onednn_has_float32
 from torchrl_caiac.data import load_minari, mix_trajectories
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.envs import (
-    KitchenEnv,
-    create_fetch_push_expert,
-    create_fetch_push_random,
-    create_kitchen_play,
-    create_kitchen_random,
-    fetch_push_layout,
-    kitchen_transitions,
-)
 from torchrl_caiac.fit import fit_world_model
 from torchrl_caiac.influence import CAI, causal_action_influence, score_buffer
 from torchrl_caiac.modules import linear_kernel
@@ -78,26 +72,49 @@ class Shape:
 
 def fetch_model() -> GaussianWorldModel:
     """Fetch-Push with two cubes, positions predicted."""
-    layout = fetch_push_layout(2)
     predict = {
-        name: layout.columns[name][:n]
+        name: FETCH.columns[name][:n]
         for name, n in {"gripper": 5, "cube0": 3, "cube1": 3}.items()
     }
-    return GaussianWorldModel(layout, 4, (256,) * 3, predict)
+    return GaussianWorldModel(FETCH, 4, (256,) * 3, predict)
 
 
 def kitchen_model() -> GaussianWorldModel:
     """The kitchen, everything predicted."""
-    return GaussianWorldModel(KitchenEnv.layout, 9, (256,) * 5, variance_floor=2e-3)
+    return GaussianWorldModel(kitchen_layout(), 9, (256,) * 5, variance_floor=2e-3)
 
 
+KEPT = Path("outputs/benchmarks")
 ACTIONS = {size: Bounded(-1.0, 1.0, (size,)) for size in (4, 9)}
 MODELS = pytest.mark.parametrize("make", [fetch_model, kitchen_model])
 
 
 @cache
 def fitted(name: str) -> Shape:
+    """Returns a model and its states, fitted at the first call on this machine."""
+    file = KEPT / f"{name}.pt"
+    if not file.exists():
+        shape = _fit(name)
+        KEPT.mkdir(parents=True, exist_ok=True)
+        torch.save({"model": shape.model.state_dict(), "states": shape.states}, file)
+        return shape
+    kept = torch.load(file, weights_only=True)
+    is_fetch = name == "Fetch-Push"
+    model = fetch_model() if is_fetch else kitchen_model()
+    model.load_state_dict(kept["model"])
+    return Shape(model, kept["states"], *((0.05, 3) if is_fetch else (0.2, 1)))
+
+
+def _fit(name: str) -> Shape:
     """Collects a few episodes and fits the model to them."""
+    from torchrl_caiac.envs import (  # needs MuJoCo
+        create_fetch_push_expert,
+        create_fetch_push_random,
+        create_kitchen_play,
+        create_kitchen_random,
+        kitchen_transitions,
+    )
+
     torch.manual_seed(0)
     with TemporaryDirectory() as folder:
         options: dict[str, Any] = {"root": folder, "workers": 1, "progress": False}

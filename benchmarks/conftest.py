@@ -124,5 +124,6 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     if config.getoption("--ratios"):
         name = "cuda" if device == "cuda" else processor_slug(machine()["processor"])
         file = Path(config.getoption("--ratios"), f"benchmark_{name}.txt")
+        file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("\n".join(lines) + "\n")
         terminalreporter.write_line(f"written to {file}")

@@ -3,19 +3,28 @@
 Its tensors say that they lie on ``cuda:0`` and keep their values on the CPU. An
 operation raises where its operands lie on two devices, and within
 :func:`nothing_waits` where the host would wait for the device, as a CUDA device does.
-What it cannot do: gradients, compiled kernels, and to be as fast.
+The package's own kernels run on the CPU, by one thread.
+What it cannot do: gradients, other compiled kernels, and to be as fast.
 """
 
 from __future__ import annotations
 
+import ctypes
+import re
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest import mock
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
+
+from torchrl_caiac import _sampling, _sampling_cuda
 
 # Operations whose result, or its size, the host has to see.
 LOOKS = {
@@ -58,6 +67,9 @@ def pretend_cuda() -> Iterator[None]:
             mock.patch("torch.cuda._lazy_init"),
             mock.patch("torch.cuda.current_device", return_value=0),
             mock.patch("torch.cuda.synchronize"),
+            mock.patch.object(_sampling, "_PLAIN", {torch.Tensor, OnCuda}),
+            mock.patch.object(_sampling_cuda, "is_there", _is_there),
+            mock.patch.object(_sampling_cuda, "run", _run),
             torch.backends.cudnn.flags(enabled=False),
             _MadeOnCuda(),
         ):
@@ -65,6 +77,48 @@ def pretend_cuda() -> Iterator[None]:
     finally:
         torch._C._set_only_lift_cpu_tensors(lifts)
         torch.__future__.set_overwrite_module_params_on_conversion(overwrites)
+
+
+def _is_there(device: torch.device) -> bool:
+    return device.type == "cuda"
+
+
+def _run(name: str, device: torch.device, grid: tuple[int, int], argument: Any) -> None:
+    _kernels()[f"run_{name}"](argument, *grid)
+
+
+@cache
+def _kernels() -> Any:
+    """Compiles the kernels for the CPU: a block has one thread, which does all."""
+    source = Path(_sampling_cuda.__file__).with_name("_sampling.cu")
+    names = re.findall(r"__global__ void (\w+)\(const (\w+) a\)", source.read_text())
+    text = f"""
+        struct Index {{ unsigned x, y, z; }};
+        static Index threadIdx, blockIdx, blockDim = {{1, 1, 1}}, gridDim;
+        #define __device__
+        #define __global__
+        #define __shared__ static
+        #define __syncthreads()
+        #define __trap() __builtin_trap()
+        template <class T> static void atomicAdd(T *sum, T value) {{ *sum += value; }}
+        #include "{source}"
+    """
+    for name, argument in names:
+        text += f"""
+            extern "C" void run_{name}(const {argument} *a, unsigned x, unsigned y)
+            {{
+                gridDim = {{x, y, 1}};
+                for (blockIdx.y = 0; blockIdx.y < y; blockIdx.y++)
+                    for (blockIdx.x = 0; blockIdx.x < x; blockIdx.x++)
+                        {name}(*a);
+            }}
+        """
+    with TemporaryDirectory() as folder:
+        file, made = Path(folder, "kernels.cpp"), Path(folder, "kernels.so")
+        file.write_text(text)
+        command = ["g++", "-O1", "-ffp-contract=off", "-shared", "-fPIC", str(file)]
+        subprocess.run([*command, "-o", str(made)], check=True)
+        return ctypes.CDLL(str(made))
 
 
 class OnCuda(torch.Tensor):
@@ -87,6 +141,9 @@ class OnCuda(torch.Tensor):
 
     def __repr__(self, **kwargs: Any) -> str:
         return f"OnCuda({self.values!r})"
+
+    def data_ptr(self) -> int:
+        return self.values.data_ptr()
 
     def tolist(self) -> Any:
         if _must_not_wait:

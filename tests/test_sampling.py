@@ -1,4 +1,4 @@
-"""The functions in C give the numbers of torch, to the bit."""
+"""The functions in C and CUDA give the numbers of torch, to the bit."""
 
 from __future__ import annotations
 
@@ -13,31 +13,39 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_caiac import EntityLayout, _sampling
+from torchrl_caiac import EntityLayout, _sampling_c
 from torchrl_caiac._fingerprints import fingerprint, matches, state_hash
 from torchrl_caiac._sampling import (
     Runs,
     all_finite,
+    chosen_windows,
     is_native,
     only_torch,
     read_columns,
     swap_rows,
 )
 from torchrl_caiac.transforms import HindsightGoal
+from torchrl_caiac.transforms.checks import LateCheck, LateValue
 from torchrl_caiac.transforms.draws import (
     DonorIndex,
     SwapDraw,
     draw_batch_donors,
     draw_buffer_donors,
+    draw_windows,
 )
 from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
 
 KINDS = [torch.float32, torch.float64, torch.float16, torch.uint8, torch.int64]
 
 
-def both(function: Any) -> tuple[Any, Any]:
-    """What C and what torch return."""
-    assert is_native()
+DEVICES = pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+)
+
+
+def both(function: Any, device: str = "cpu") -> tuple[Any, Any]:
+    """What C or CUDA and what torch return."""
+    assert is_native(torch.zeros(1, device=device))
     in_c = function()
     with only_torch():
         return in_c, function()
@@ -49,9 +57,10 @@ def assert_same_draws(one: SwapDraw, other: SwapDraw) -> None:
 
 
 def bits(tensor: torch.Tensor) -> bytes:
-    return tensor.contiguous().view(torch.uint8).numpy().tobytes()
+    return tensor.cpu().contiguous().view(torch.uint8).numpy().tobytes()
 
 
+@DEVICES
 @settings(max_examples=100, deadline=None)
 @given(
     shape=st.tuples(st.integers(1, 12), st.integers(1, 4)),
@@ -63,6 +72,7 @@ def bits(tensor: torch.Tensor) -> bytes:
     seed=st.integers(0, 1000),
 )
 def test_donors_of_a_batch(
+    device: str,
     shape: tuple[int, int],
     drawn: int,
     window: int,
@@ -75,6 +85,7 @@ def test_donors_of_a_batch(
     of = torch.Generator().manual_seed(seed)
     free = torch.rand(shape, generator=of) < share
     chosen = torch.rand(drawn, generator=of) < 0.5 if has_chosen else None
+    free, chosen = free.to(device), None if chosen is None else chosen.to(device)
     in_c, in_torch = both(
         lambda: draw_batch_donors(
             free,
@@ -83,11 +94,13 @@ def test_donors_of_a_batch(
             swap_prob=swap_prob,
             chosen=chosen,
             generator=torch.Generator().manual_seed(seed),
-        )
+        ),
+        device,
     )
     assert_same_draws(in_c, in_torch)
 
 
+@DEVICES
 @settings(max_examples=100, deadline=None)
 @given(
     owners=st.lists(st.integers(-1, 2), min_size=3, max_size=8),
@@ -99,6 +112,7 @@ def test_donors_of_a_batch(
     seed=st.integers(0, 1000),
 )
 def test_swapped_rows(
+    device: str,
     owners: list[int],
     dtype: torch.dtype,
     windows: int,
@@ -116,7 +130,7 @@ def test_swapped_rows(
 
     def values(rows: int) -> torch.Tensor:
         found = torch.randint(0, 200, (rows, len(owners)), generator=of)
-        return found.to(dtype)
+        return found.to(device, dtype)
 
     batch = TensorDict(
         {
@@ -125,12 +139,15 @@ def test_swapped_rows(
         },
         [windows * window],
     )
-    free = torch.rand(windows, 3, generator=of) < 0.7
+    free = (torch.rand(windows, 3, generator=of) < 0.7).to(device)
     draw = draw_batch_donors(free, drawn, window=window, generator=of)
     planner = SwapPlanner(layout)
     sources = [values(windows * window) for _ in range(2)] if other else None
     in_c, in_torch = both(
-        lambda: apply_swap(batch, *planner(batch), draw, window=window, sources=sources)
+        lambda: apply_swap(
+            batch, *planner(batch), draw, window=window, sources=sources
+        ),
+        device,
     )
     for key in ("observation", ("next", "observation")):
         assert bits(in_c[key]) == bits(in_torch[key])
@@ -138,6 +155,7 @@ def test_swapped_rows(
         assert in_c[key].data_ptr() != batch[key].data_ptr()
 
 
+@DEVICES
 @settings(max_examples=100, deadline=None)
 @given(
     shape=st.tuples(st.integers(1, 8), st.integers(1, 3)),
@@ -148,6 +166,7 @@ def test_swapped_rows(
     seed=st.integers(0, 1000),
 )
 def test_donors_of_a_buffer(
+    device: str,
     shape: tuple[int, int],
     sizes: list[int],
     is_short: bool,
@@ -158,11 +177,11 @@ def test_donors_of_a_buffer(
     of = torch.Generator().manual_seed(seed)
     free = torch.rand(shape, generator=of) < 0.7
     chosen = torch.rand(shape[0], generator=of) < 0.5 if has_chosen else None
+    free, chosen = free.to(device), None if chosen is None else chosen.to(device)
     size = torch.tensor(sizes[: shape[1]])
     starts = torch.randint(0, 99, (max(1, int(size.sum())),), generator=of)
-    index = DonorIndex(
-        starts.int() if is_short else starts, size.cumsum(0) - size, size
-    )
+    starts = starts.int() if is_short else starts
+    index = DonorIndex(*(x.to(device) for x in (starts, size.cumsum(0) - size, size)))
     in_c, in_torch = both(
         lambda: draw_buffer_donors(
             free,
@@ -170,11 +189,13 @@ def test_donors_of_a_buffer(
             swap_prob=swap_prob,
             chosen=chosen,
             generator=torch.Generator().manual_seed(seed),
-        )
+        ),
+        device,
     )
     assert_same_draws(in_c, in_torch)
 
 
+@DEVICES
 @settings(max_examples=100, deadline=None)
 @given(
     rows=st.integers(1, 12),
@@ -185,6 +206,7 @@ def test_donors_of_a_buffer(
     seed=st.integers(0, 1000),
 )
 def test_sources_of_hindsight_goals(
+    device: str,
     rows: int,
     share: float,
     future: float,
@@ -201,26 +223,31 @@ def test_sources_of_hindsight_goals(
         counterfactual=counterfactual,
     )
     flags = torch.rand(rows, 1, generator=torch.Generator().manual_seed(seed)) < share
+    flags = flags.to(device)
     in_c, in_torch = both(
         lambda: goals.generate_parameters(
             flags,
             {"desired_goal": torch.zeros(rows, 1)},
             torch.Generator().manual_seed(seed),
-        )
+        ),
+        device,
     )
     assert torch.equal(in_c.source, in_torch.source)
 
 
+@DEVICES
 @given(
     columns=st.lists(st.integers(0, 4), min_size=1, max_size=6),
     dtype=st.sampled_from(KINDS),
     rows=st.none() | st.lists(st.integers(0, 5), max_size=4),
 )
 def test_columns_of_rows(
-    columns: list[int], dtype: torch.dtype, rows: list[int] | None
+    device: str, columns: list[int], dtype: torch.dtype, rows: list[int] | None
 ) -> None:
-    source = torch.arange(30).view(6, 5).to(dtype)
-    picked = None if rows is None else torch.tensor(rows, dtype=torch.int64)
+    source = torch.arange(30).view(6, 5).to(device, dtype)
+    picked = None
+    if rows is not None:
+        picked = torch.tensor(rows, dtype=torch.int64).to(device)
     found = read_columns(source, columns, picked)
     wanted = source if picked is None else source[picked]
     assert torch.equal(found, wanted[:, columns])
@@ -237,9 +264,10 @@ def test_rows_out_of_range(row: int) -> None:
         )
     with pytest.raises(IndexError, match=f"row {row} is out of range"):
         donors, swapped = rows.view(2, 1), torch.ones(2, 1, dtype=torch.bool)
-        swap_rows(state, state, Runs.of([0, 0], 4), donors, swapped, 1)
+        swap_rows([state], [state], [Runs.of([0, 0], 4)], donors, swapped, 1)
 
 
+@DEVICES
 @settings(max_examples=60, deadline=None)
 @given(
     rows=st.integers(1, 9),
@@ -249,7 +277,7 @@ def test_rows_out_of_range(row: int) -> None:
     seed=st.integers(0, 1000),
 )
 def test_rows_that_changed(
-    rows: int, width: int, changed: list[int], some: bool, seed: int
+    device: str, rows: int, width: int, changed: list[int], some: bool, seed: int
 ) -> None:
     of = torch.Generator().manual_seed(seed)
     state, after = (1e3 * torch.randn(rows, width, generator=of) for _ in "ab")
@@ -261,20 +289,70 @@ def test_rows_that_changed(
         if row < rows:
             state[row, 0] = -state[row, 0]
     picked = torch.randint(0, rows, (4,), generator=of) if some else None
-    hashes = both(lambda: state_hash(td, ["x", ("next", "x")]))
-    assert torch.equal(*hashes)
-    in_c, in_torch = both(
-        lambda: matches(td, known, ["x"], [("next", "x")], ("a", "b"), picked)
-    )
-    assert torch.equal(in_c, in_torch)
     whole = torch.ones(rows, dtype=torch.bool)
     whole[[row for row in changed if row < rows and changed.count(row) % 2]] = False
-    assert torch.equal(in_c, whole if picked is None else whole[picked])
+    whole = whole if picked is None else whole[picked]
+    td, known = td.to(device), known.to(device)
+    picked = None if picked is None else picked.to(device)
+    hashes = both(lambda: state_hash(td, ["x", ("next", "x")]), device)
+    assert torch.equal(*hashes)
+    in_c, in_torch = both(
+        lambda: matches(td, known, ["x"], [("next", "x")], ("a", "b"), picked), device
+    )
+    assert torch.equal(in_c, in_torch)
+    assert torch.equal(in_c.cpu(), whole)
+
+
+@pytest.mark.gpu
+@given(
+    windows=st.integers(1, 12), share=st.floats(0, 1), levels=st.sampled_from([2, 99])
+)
+def test_windows_that_are_chosen(windows: int, share: float, levels: int) -> None:
+    of = torch.Generator().manual_seed(windows)
+    number = torch.randint(levels, (windows,), generator=of).double()  # also equal ones
+    count = round(share * windows)
+    found = chosen_windows(number.to("cuda"), count).cpu()
+    assert torch.equal(found, number.argsort(stable=True).argsort() < count)
+    device = torch.device("cuda")
+    assert int(draw_windows(windows, count, device=device).cpu().sum()) == count
+    with only_torch():
+        assert int(draw_windows(windows, count, device=device).cpu().sum()) == count
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("number", [5, 40])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
+@pytest.mark.parametrize("bad", [None, "inf", "nan"])
+def test_values_that_are_looked_at(
+    number: int, dtype: torch.dtype, bad: str | None
+) -> None:
+    def found() -> list[int]:
+        late = LateCheck()
+        values = torch.zeros(7, dtype=dtype)
+        worst = values.clone()
+        if bad is not None:
+            worst[3] = float(bad)
+        values, worst = values.to("cuda"), worst.to("cuda")
+        here = worst == worst[3]
+        looked: list[LateValue | None] = [LateValue(values)] * number
+        looked[0] = None
+        looked[1] = LateValue(here, "true", values.bool())
+        looked[2] = LateValue(~values.bool(), "false")
+        looked[3] = LateValue(worst, "infinite")
+        looked[number - 1] = LateValue(worst)
+        late.look(looked)
+        torch.cuda.synchronize()
+        return late.found()
+
+    with only_torch():
+        wanted = found()
+    assert found() == wanted
+    assert wanted == {None: [], "inf": [3, number - 1], "nan": [number - 1]}[bad]
 
 
 @pytest.mark.parametrize("value", [0.0, -0.0, 1e-45, 3.4e38, -3.4e38])
 def test_finite_numbers(value: float) -> None:
-    assert all_finite(torch.full((7,), value))
+    assert all_finite([torch.full((7,), value)])
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -282,7 +360,7 @@ def test_finite_numbers(value: float) -> None:
 def test_numbers_that_are_not_finite(value: float, place: int) -> None:
     values = torch.zeros(7)
     values[place] = value
-    assert not all_finite(values)
+    assert not all_finite([torch.zeros(2), values])
 
 
 def test_tensors_that_need_torch() -> None:
@@ -307,13 +385,13 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     yield tmp_path / "torchrl_caiac"
     monkeypatch.undo()
-    _sampling._library.cache_clear()
+    _sampling_c.library.cache_clear()
     assert is_native()
 
 
 def is_native_anew() -> bool:
     """What a new process finds."""
-    _sampling._library.cache_clear()
+    _sampling_c.library.cache_clear()
     return is_native()
 
 

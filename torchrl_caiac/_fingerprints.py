@@ -12,8 +12,9 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join, path
 from torchrl_caiac._sampling import (
+    MOST_LEAVES,
     is_native,
-    is_native_source,
+    plain,
     row_sums,
     state_matches,
 )
@@ -83,7 +84,7 @@ def state_hash(
     total: torch.Tensor | None = None
     for number, leaf in enumerate(state_leaves(td, keys)):
         leaf = leaf if rows is None else leaf[rows]
-        if leaf.dtype is torch.float32 and leaf.ndim == 2 and is_native(leaf):
+        if _is_row_of_floats(leaf) and leaf.device.type == "cpu" and is_native(leaf):
             found = row_sums(leaf, _weights(leaf.shape[1], number, 1, leaf.device))
         else:
             found = _weighted(_lanes(leaf), number, 1)
@@ -168,26 +169,28 @@ def _matched(
     names: Sequence[str],
     rows: torch.Tensor | None,
 ) -> torch.Tensor | None:
-    """Returns what :func:`matches` does, in C; ``None`` if these data need torch."""
-    known = known.as_subclass(torch.Tensor)
+    """Returns what :func:`matches` does, in C or CUDA; ``None`` if they need torch."""
+    known = plain(known)
     numbers = (known,) if rows is None else (known, rows)
     if any(x.dtype is not torch.int64 or x.ndim != 1 for x in numbers):
-        return None
-    if not is_native_source(known) or not is_native(numbers[-1]):
         return None
     leaves, weights = [], []
     for entries, factor in ((keys, 1), (next_keys, _NEXT)):
         for number, leaf in enumerate(state_leaves(td, entries)):
-            leaf = leaf.as_subclass(torch.Tensor)
-            if leaf.dtype is not torch.float32 or leaf.ndim != 2:
-                return None
-            if len(leaf) < len(known):
+            leaf = plain(leaf)
+            if not _is_row_of_floats(leaf) or len(leaf) < len(known):
                 return None
             leaves.append(leaf)
             weights.append(_weights(leaf.shape[1], number, factor, leaf.device))
-    if not is_native_source(*leaves):
+    if len(leaves) > MOST_LEAVES or not is_native(
+        numbers[-1], sources=[known, *leaves]
+    ):
         return None
     return state_matches(leaves, weights, known, _upper_half(tuple(names)), rows)
+
+
+def _is_row_of_floats(leaf: torch.Tensor) -> bool:
+    return leaf.dtype is torch.float32 and leaf.ndim == 2
 
 
 def is_fingerprint_of(

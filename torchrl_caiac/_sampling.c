@@ -172,11 +172,11 @@ int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
     return GOOD;
 }
 
-/* swap.apply_swap: rows of a leaf, in which entities are those of their donors.
+/* Rows of a leaf, in which entities are those of their donors.
  *
  * An entity has runs of bytes in a row: run i is that of entity run_entity[i].
  */
-int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities,
+static int64_t swap_leaf(int64_t first, int64_t drawn, int64_t window, int64_t entities,
                int64_t length, const int64_t *donors, const uint8_t *swapped, int64_t row_bytes,
                int64_t runs, const int64_t *run_entity, const int64_t *run_start,
                const int64_t *run_bytes, const char *own, const char *source, char *out)
@@ -206,6 +206,26 @@ int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities
                 memcpy(to + w * row_bytes + run_start[i],
                        from + w * row_bytes + run_start[i], (size_t)run_bytes[i]);
         }
+    }
+    return GOOD;
+}
+
+/* swap.apply_swap: the rows of all leaves.
+ *
+ * A leaf has nine numbers in the table: those of its source, its bytes a row, its runs,
+ * and the addresses of their entities, starts and lengths, of own, source and out.
+ */
+int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities,
+                  const int64_t *donors, const uint8_t *swapped, int64_t leaves,
+                  const int64_t *table)
+{
+    for (; leaves > 0; leaves--, table += 9) {
+        int64_t bad = swap_leaf(
+            first, drawn, window, entities, table[0], donors, swapped, table[1], table[2],
+            (const int64_t *)table[3], (const int64_t *)table[4], (const int64_t *)table[5],
+            (const char *)table[6], (const char *)table[7], (char *)table[8]);
+        if (bad != GOOD)
+            return bad;
     }
     return GOOD;
 }

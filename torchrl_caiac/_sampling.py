@@ -1,54 +1,48 @@
-"""What sampling does to each row, in C: compiled where it runs, by the C compiler.
+"""What sampling does to each row, in C or CUDA: compiled where it runs.
 
 Each function gives the numbers of its reference, which computes them by operations of
-torch, to the bit. Without a compiler the reference is used.
+torch, to the bit. Without a compiler the reference is used. The functions are in
+``_sampling.c``, for tensors on the CPU, and in ``_sampling.cu``.
 """
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import json
-import logging
-import os
-import shutil
-import subprocess
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache, lru_cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from functools import lru_cache, partial
+from typing import NamedTuple, TypeVar
 
 import torch
 
-from torchrl_caiac._kernels import cache_folder, machine, processor_slug
-from torchrl_caiac._whole_files import whole_file
+from torchrl_caiac import _sampling_cuda as cuda
+from torchrl_caiac._sampling_c import addresses, call, call_with_rows, library
 
 __all__ = [
+    "MOST_LEAVES",
     "Runs",
     "all_finite",
     "batch_donors",
     "buffer_donors",
+    "chosen_windows",
     "hindsight_sources",
     "is_native",
-    "is_native_source",
+    "look",
     "only_torch",
+    "plain",
     "read_columns",
     "row_sums",
     "state_matches",
     "swap_rows",
 ]
 
-_logger = logging.getLogger("torchrl_caiac")
+_T = TypeVar("_T")
 
-_SOURCE = Path(__file__).with_suffix(".c")
-_FLAGS = ("-O3", "-march=native", "-std=c99", "-shared", "-fPIC")
-_SECONDS = 60  # for compiling
+# Leaves of a state that are compared with fingerprints at once.
+MOST_LEAVES = cuda.LEAVES
 # Numbers of a batch from which torch, with several threads, may be faster.
 _MOST = 1 << 22
-_GOOD = -1  # what functions in C return if no row is out of range
 _off: ContextVar[bool] = ContextVar("only_torch", default=False)
 
 
@@ -59,13 +53,14 @@ class Runs(NamedTuple):
         entity (torch.Tensor): the entity of each run of bytes, int64 ``[R]``.
         start (torch.Tensor): its first byte in the row, int64 ``[R]``.
         length (torch.Tensor): its bytes, int64 ``[R]``.
-        last (int): the highest entity, -1 if there is none.
+        owners (tuple of int): the entity of each column, -1 for nobody; empty if runs
+            are those of some columns.
     """
 
     entity: torch.Tensor
     start: torch.Tensor
     length: torch.Tensor
-    last: int
+    owners: tuple[int, ...]
 
     @classmethod
     def of(cls, owners: Sequence[int], itemsize: int) -> Runs:
@@ -77,7 +72,7 @@ class Runs(NamedTuple):
             tensor([ 0, 12])
         """
         pairs = [(owner, c) for c, owner in enumerate(owners) if owner >= 0]
-        return cls.of_columns(pairs, itemsize)
+        return cls.of_columns(pairs, itemsize)._replace(owners=tuple(owners))
 
     @classmethod
     def of_columns(cls, pairs: Sequence[tuple[int, int]], itemsize: int) -> Runs:
@@ -90,7 +85,7 @@ class Runs(NamedTuple):
                 runs.append([owner, column * itemsize, itemsize])
         table = torch.tensor(runs, dtype=torch.int64).reshape(-1, 3)
         entity, start, length = table.t().contiguous().unbind()
-        return cls(entity, start, length, max((n for n, _ in pairs), default=-1))
+        return cls(entity, start, length, ())
 
 
 @contextmanager
@@ -110,38 +105,52 @@ def only_torch() -> Iterator[None]:
         _off.reset(token)
 
 
-def is_native(*tensors: torch.Tensor) -> bool:
-    """Returns whether tensors are computed in C: plain, contiguous, on the CPU.
+def is_native(*tensors: torch.Tensor, sources: Sequence[torch.Tensor] = ()) -> bool:
+    """Returns whether tensors are computed in C or CUDA: plain ones on one device.
 
     Args:
-        *tensors (torch.Tensor): the tensors.
+        *tensors (torch.Tensor): the tensors of a batch.
+
+    Keyword Args:
+        sources (sequence of torch.Tensor): tensors that rows are read from, which may
+            be large.
 
     Returns:
-        bool: whether they are, and C can be used here.
+        bool: whether they are, and the functions can be used here.
     """
-    if not is_native_source(*tensors):
-        return False
-    if any(x.numel() > _MOST for x in tensors) and torch.get_num_threads() > 1:
-        return False
     if _off.get() or torch.compiler.is_compiling():
         return False
-    return _library() is not None
+    device = tensors[0].device if tensors else torch.device("cpu")
+    if not all(map(partial(_is_plain, device=device), (*tensors, *sources))):
+        return False
+    if device.type != "cpu":
+        return cuda.is_there(device)
+    if torch.get_num_threads() > 1 and any(x.numel() > _MOST for x in tensors):
+        return False
+    return library() is not None
 
 
-def is_native_source(*tensors: torch.Tensor) -> bool:
-    """Returns whether tensors of any size can be read in C."""
-    return all(
-        type(x) is torch.Tensor
-        and x.device.type == "cpu"
-        and x.is_contiguous()
-        and not (x.requires_grad or x.is_neg() or x.is_conj())
-        and (x.data_ptr() != 0 or not x.numel())
-        for x in tensors
+# Kinds of tensors whose numbers are at their addresses.
+_PLAIN = {torch.Tensor}
+
+
+def _is_plain(tensor: torch.Tensor, device: torch.device) -> bool:
+    return (
+        type(tensor) in _PLAIN
+        and tensor.device == device
+        and tensor.is_contiguous()
+        and not (tensor.requires_grad or tensor.is_neg() or tensor.is_conj())
+        and (tensor.data_ptr() != 0 or not tensor.numel())
     )
 
 
+def plain(tensor: torch.Tensor) -> torch.Tensor:
+    """Returns a view of a tensor, such as a memory-mapped one, without its class."""
+    return tensor if type(tensor) in _PLAIN else tensor.as_subclass(torch.Tensor)
+
+
 def row_sums(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Returns the sums of the bits of float32 numbers with weights.
+    """Returns the sums of the bits of float32 numbers with weights, on the CPU.
 
     Args:
         values (torch.Tensor): float32 ``[B, L]``.
@@ -151,7 +160,7 @@ def row_sums(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         torch.Tensor: int64 ``[B]``.
     """
     sums = torch.empty(len(values), dtype=torch.int64)
-    _call(
+    call(
         "row_sums",
         *values.shape,
         values,
@@ -183,8 +192,19 @@ def state_matches(
         torch.Tensor: bool ``[B]``.
     """
     count = len(known) if rows is None else len(rows)
-    valid = torch.empty(count, dtype=torch.bool)
-    _call_with_rows(
+    valid = torch.empty(count, dtype=torch.bool, device=known.device)
+    if known.is_cuda:
+        widths = [leaf.shape[1] for leaf in leaves]
+        fields = [
+            *(count, len(known), cuda.address(rows), len(leaves)),
+            *(cuda.address(known), upper, cuda.address(valid)),
+            *_padded([leaf.data_ptr() for leaf in leaves]),
+            *_padded(widths),
+            *_padded([weight.data_ptr() for weight in weights]),
+        ]
+        cuda.start("state_matches", known.device, (cuda.blocks(count), 1), fields)
+        return valid
+    call_with_rows(
         "state_matches",
         rows,
         len(known),
@@ -192,9 +212,9 @@ def state_matches(
         len(known),
         rows,
         len(leaves),
-        _array(leaves),
+        addresses(leaves),
         (ctypes.c_int64 * len(leaves))(*(leaf.shape[1] for leaf in leaves)),
-        _array(weights),
+        addresses(weights),
         known,
         upper,
         valid,
@@ -229,9 +249,19 @@ def batch_donors(
         without a donor int64 ``[N]``.
     """
     count, entities = free.shape
-    found = _empty_draw(drawn, entities)
+    found = _empty_draw(free, drawn)
+    if free.is_cuda:
+        listed = torch.empty(2, entities, count, dtype=torch.int64, device=free.device)
+        fields = [
+            *(count, count - drawn, entities, window),
+            *map(cuda.address, (free, chosen, chance)),
+            swap_prob,
+            *map(cuda.address, (share, *listed.unbind(), *found)),
+        ]
+        cuda.start("batch_donors", free.device, (entities, 1), fields)
+        return found
     listed = torch.empty(count, dtype=torch.int64)
-    _call(
+    call(
         "batch_donors",
         count,
         count - drawn,
@@ -274,8 +304,21 @@ def buffer_donors(
     Returns:
         tuple of torch.Tensor: as of :func:`batch_donors`.
     """
-    found = _empty_draw(*free.shape)
-    _call(
+    found = _empty_draw(free, len(free))
+    if free.is_cuda:
+        fields = [
+            *free.shape,
+            *map(cuda.address, (free, chosen, chance)),
+            swap_prob,
+            *map(cuda.address, (share, offset, size)),
+            len(starts),
+            starts.dtype is torch.int32,
+            *map(cuda.address, (starts, found[0], found[1], found[2].zero_())),
+        ]
+        blocks = cuda.blocks(free.numel())
+        cuda.start("buffer_donors", free.device, (blocks, 1), fields)
+        return found
+    call(
         "buffer_donors",
         *free.shape,
         free,
@@ -294,11 +337,28 @@ def buffer_donors(
 
 
 def _empty_draw(
-    drawn: int, entities: int
+    free: torch.Tensor, drawn: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    donors = torch.empty(drawn, entities, dtype=torch.int64)
-    swapped = torch.empty(drawn, entities, dtype=torch.bool)
-    return donors, swapped, torch.empty(entities, dtype=torch.int64)
+    entities = free.shape[1]
+    donors = free.new_empty(drawn, entities, dtype=torch.int64)
+    swapped = free.new_empty(drawn, entities)
+    return donors, swapped, free.new_empty(entities, dtype=torch.int64)
+
+
+def chosen_windows(number: torch.Tensor, count: int) -> torch.Tensor:
+    """Returns the windows that have the smallest numbers, on a CUDA device.
+
+    Args:
+        number (torch.Tensor): random numbers, float64 ``[B]``.
+        count (int): how many windows are chosen.
+
+    Returns:
+        torch.Tensor: bool ``[B]``.
+    """
+    chosen = torch.empty_like(number, dtype=torch.bool)
+    fields = len(number), count, number.data_ptr(), chosen.data_ptr()
+    cuda.start("chosen_windows", number.device, (cuda.blocks(len(number)), 1), fields)
+    return chosen
 
 
 def hindsight_sources(
@@ -322,8 +382,18 @@ def hindsight_sources(
     Returns:
         torch.Tensor: int64 ``[B]``, below ``3 B``, see ``HindsightDraw``.
     """
-    order, source = torch.empty(2, len(flags), dtype=torch.int64).unbind()
-    _call(
+    found = flags.new_empty(2, len(flags), dtype=torch.int64)
+    order, source = found.unbind()
+    if flags.is_cuda:
+        fields = [
+            len(flags),
+            *map(cuda.address, (flags, chance, pick)),
+            *(future, random, counterfactual),
+            *map(cuda.address, (order, source)),
+        ]
+        cuda.start("hindsight_sources", flags.device, (1, 1), fields)
+        return source
+    call(
         "hindsight_sources",
         len(flags),
         flags,
@@ -352,9 +422,19 @@ def read_columns(
         torch.Tensor: ``[M, len(columns)]``.
     """
     count = len(source) if rows is None else len(rows)
-    out = torch.empty(count, len(columns), dtype=source.dtype)
+    out = source.new_empty(count, len(columns))
+    if source.is_cuda:
+        where = _on_device(tuple(columns), source.device)
+        fields = [
+            *(count, len(source), cuda.address(rows), where.data_ptr()),
+            *(len(columns), source.shape[1], source.element_size()),
+            *map(cuda.address, (source, out)),
+        ]
+        blocks = cuda.blocks(out.numel())
+        cuda.start("read_columns", source.device, (blocks, 1), fields)
+        return out
     runs = _column_runs(tuple(columns), source.element_size())
-    _call_with_rows(
+    call_with_rows(
         "read_columns",
         rows,
         len(source),
@@ -371,170 +451,126 @@ def read_columns(
     return out
 
 
+@lru_cache(maxsize=256)
+def _on_device(numbers: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    return torch.tensor(numbers, dtype=torch.int64, device=device)
+
+
 @lru_cache(maxsize=64)
 def _column_runs(columns: tuple[int, ...], itemsize: int) -> Runs:
     return Runs.of_columns([(0, column) for column in columns], itemsize)
 
 
 def swap_rows(
-    own: torch.Tensor,
-    source: torch.Tensor,
-    runs: Runs,
+    own: Sequence[torch.Tensor],
+    sources: Sequence[torch.Tensor],
+    runs: Sequence[Runs],
     donors: torch.Tensor,
     swapped: torch.Tensor,
     window: int,
-) -> torch.Tensor:
+) -> list[torch.Tensor]:
     """Returns the rows of a batch, in which entities are those of their donors.
 
     Args:
-        own (torch.Tensor): the rows, ``[B * window, ...]``.
-        source (torch.Tensor): what donors are rows of, ``[T, ...]``.
-        runs (Runs): where the entities are in a row.
+        own (sequence of torch.Tensor): leaves of the batch, ``[B * window, ...]``.
+        sources (sequence of torch.Tensor): for each leaf what donors are rows of,
+            ``[T, ...]``.
+        runs (sequence of Runs): for each leaf where the entities are in a row.
         donors (torch.Tensor): the first row of each donor, int64 ``[C, N]``.
         swapped (torch.Tensor): which entities of the last ``C`` windows are swapped,
             bool ``[C, N]``.
         window (int): rows in a window.
 
     Returns:
-        torch.Tensor: ``[B * window, ...]``.
+        list of torch.Tensor: for each leaf ``[B * window, ...]``.
     """
-    out = torch.empty_like(own)
     drawn, entities = swapped.shape
-    _call_with_rows(
+    rows = len(own[0])
+    outs = [torch.empty_like(leaf) for leaf in own]
+    leaves = list(zip(own, sources, runs, outs, strict=True))
+    if swapped.is_cuda:
+        for some in _groups(leaves):
+            fields = [rows - drawn * window, drawn, window, entities]
+            fields += [donors.data_ptr(), swapped.data_ptr()]
+            for column in zip(*(_leaf_fields(*leaf) for leaf in some), strict=True):
+                fields += _padded(column)
+            blocks = cuda.blocks(max(leaf.numel() for leaf, *_ in some))
+            cuda.start("swap_rows", swapped.device, (blocks, len(some)), fields)
+        return outs
+    table = [
+        number
+        for leaf, source, where, out in leaves
+        for number in (
+            len(source),
+            leaf.nbytes // rows,
+            len(where.entity),
+            *map(cuda.address, (*where[:3], leaf, source, out)),
+        )
+    ]
+    call_with_rows(
         "swap_rows",
         donors,
-        len(source),
-        len(own) - drawn * window,
+        min(map(len, sources)),
+        rows - drawn * window,
         drawn,
         window,
         entities,
-        len(source),
         donors,
         swapped,
-        own.nbytes // len(own),
-        len(runs.entity),
-        runs.entity,
-        runs.start,
-        runs.length,
-        own,
-        source,
-        out,
+        len(leaves),
+        (ctypes.c_int64 * len(table))(*table),
     )
-    return out
+    return outs
 
 
-def all_finite(values: torch.Tensor) -> bool:
-    """Returns whether all numbers of a float32 tensor are finite."""
-    return bool(_call("all_finite", values.numel(), values))
+def _leaf_fields(
+    own: torch.Tensor, source: torch.Tensor, runs: Runs, out: torch.Tensor
+) -> list[int]:
+    """Returns what the kernel ``swap_rows`` knows of a leaf."""
+    owners, width = runs.owners, own.numel() // len(own)
+    if len(owners) == 1:  # of all values
+        owner, entity = 0, owners[0]
+    else:
+        owner, entity = _on_device(owners, own.device).data_ptr(), -1
+    places = map(cuda.address, (own, source, out))
+    return [*places, len(source), width, own.element_size(), owner, entity]
 
 
-# --- the library ---------------------------------------------------------------------
+def all_finite(leaves: Sequence[torch.Tensor]) -> bool:
+    """Returns whether all numbers of float32 tensors on the CPU are finite."""
+    return all(call("all_finite", leaf.numel(), leaf) for leaf in leaves)
 
 
-def _array(tensors: Sequence[torch.Tensor]) -> Any:
-    return (ctypes.c_void_p * len(tensors))(*(x.data_ptr() for x in tensors))
-
-
-def _call(name: str, *args: Any) -> Any:
-    """Calls a function; tensors are passed as the addresses of their numbers."""
-    functions = _library()
-    assert functions is not None  # is_native() is true
-    return functions[name](
-        *(x.data_ptr() if isinstance(x, torch.Tensor) else x for x in args)
-    )
-
-
-def _call_with_rows(
-    name: str, rows: torch.Tensor | None, length: int, *args: Any
+def look(
+    found: torch.Tensor,
+    values: Sequence[tuple[int, torch.Tensor, int, torch.Tensor | None]],
 ) -> None:
-    place = _call(name, *args)
-    if place != _GOOD:
-        bad = place if rows is None else int(rows.flatten()[place])
-        raise IndexError(f"row {bad} is out of range: there are {length} rows")
+    """Marks the tensors of a CUDA device that have bad values.
 
-
-_P, _I = ctypes.c_void_p, ctypes.c_int64
-_ARGUMENTS: dict[str, list[Any]] = {
-    "row_sums": [_I, _I, _P, _P, _P],
-    "state_matches": [_I, _I, _P, _I, _P, _P, _P, _P, _I, _P],
-    "batch_donors": [*[_I] * 4, *[_P] * 3, ctypes.c_float, *[_P] * 5],
-    "buffer_donors": [_I, _I, *[_P] * 3, ctypes.c_float, *[_P] * 3, _I, _I, *[_P] * 4],
-    "hindsight_sources": [_I, *[_P] * 3, *[ctypes.c_double] * 3, _P, _P],
-    "read_columns": [_I, _I, _P, _I, _I, *[_P] * 4],
-    "swap_rows": [*[_I] * 5, _P, _P, _I, _I, *[_P] * 6],
-    "all_finite": [_I, _P],
-}
-
-
-@cache
-def _library() -> dict[str, Callable[..., Any]] | None:
-    """Returns the functions in C, ``None`` if they cannot be compiled."""
-    if os.environ.get("TORCHRL_CAIAC_NATIVE") == "0":
-        return None
-    try:
-        library = _load()
-    except (OSError, subprocess.SubprocessError) as error:
-        _logger.warning(
-            "sampling is slower, as its functions in C are not compiled: %s. Install a "
-            "C compiler (apt-get install gcc), or name one in the environment "
-            "variable CC",
-            error,
+    Args:
+        found (torch.Tensor): float64 ``[V]``, gets NaN where something is bad.
+        values (sequence of tuple): the place in ``found``, a tensor, the kind of bad
+            value as in ``_sampling.cu``, and which values count, bool, if not all.
+    """
+    for some in _groups(values):
+        fields = [found.data_ptr()]
+        columns = zip(
+            *(
+                (cuda.address(x), cuda.address(where), x.numel(), kind, place)
+                for place, x, kind, where in some
+            ),
+            strict=True,
         )
-        return None
-    functions = {}
-    for name, arguments in _ARGUMENTS.items():
-        function = getattr(library, name)
-        function.argtypes = arguments
-        function.restype = ctypes.c_int32 if name == "all_finite" else ctypes.c_int64
-        functions[name] = function
-    return functions
+        for column in columns:
+            fields += _padded(column)
+        blocks = cuda.blocks(max(x.numel() for _, x, *_ in some))
+        cuda.start("look", found.device, (blocks, len(some)), fields)
 
 
-def _load() -> ctypes.CDLL:
-    """Loads the library of this processor, which is compiled once."""
-    names = (os.environ.get("CC"), "cc", "gcc", "clang")
-    compiler = next((found for n in names if n and (found := shutil.which(n))), None)
-    if compiler is None:
-        raise FileNotFoundError("there is no C compiler")
-    own = {**machine(), "flags": _FLAGS, "compiler": compiler}
-    del own["threads"]
-    key = _SOURCE.read_bytes() + json.dumps(own).encode()
-    slug = processor_slug(str(own["processor"]))
-    name = f"sampling-{slug}-{hashlib.sha256(key).hexdigest()[:12]}.so"
-    folder = cache_folder()
-    file = None if folder is None else folder / name
-    if file is not None and _is_mine(file):
-        try:
-            return ctypes.CDLL(str(file))
-        except OSError as error:  # damaged
-            _logger.debug("%s is compiled again: %s", file, error)
-    with tempfile.TemporaryDirectory() as work:
-        made = Path(work, name)
-        subprocess.run(
-            [compiler, *_FLAGS, str(_SOURCE), "-o", str(made)],
-            check=True,
-            capture_output=True,
-            timeout=_SECONDS,
-        )
-        # It stays loaded without its file.
-        return ctypes.CDLL(str(made if file is None else _kept(made, file)))
+def _groups(items: Sequence[_T]) -> Iterator[Sequence[_T]]:
+    """Yields as many items as one start of a kernel reads."""
+    return (items[i : i + cuda.LEAVES] for i in range(0, len(items), cuda.LEAVES))
 
 
-def _is_mine(file: Path) -> bool:
-    """Returns whether this user alone can have written a file."""
-    if not file.is_file():
-        return False
-    status = file.stat()
-    return status.st_uid == os.geteuid() and not status.st_mode & 0o022
-
-
-def _kept(made: Path, file: Path) -> Path:
-    """Copies a file for the next process; returns the one to load."""
-    try:
-        with whole_file(file) as partial:
-            shutil.copyfile(made, partial)
-            partial.chmod(0o700)
-    except OSError as error:
-        _logger.debug("%s is not kept: %s", file, error)
-        return made
-    return file
+def _padded(numbers: Sequence[int]) -> list[int]:
+    return [*numbers, *[0] * (cuda.LEAVES - len(numbers))]

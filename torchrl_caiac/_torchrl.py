@@ -33,6 +33,7 @@ from torchrl.objectives.utils import _vmap_func
 
 __all__ = [
     "add_revision",
+    "compile_cuda",
     "drop_memmap_leaf",
     "drop_prefetched",
     "file_name",
@@ -557,6 +558,27 @@ def packed_linear(
         return out
 
     return apply
+
+
+def compile_cuda(source: str, names: list[str]) -> dict[str, Any]:
+    """Compiles kernels for the current CUDA device, by NVRTC.
+
+    Args:
+        source (str): the source in CUDA C++.
+        names (list of str): its kernels, declared ``extern "C"``.
+
+    Returns:
+        dict: the driver's handle of each kernel.
+
+    Raises:
+        OSError: there is no compiler.
+        RuntimeError: it refuses the source.
+    """
+    from torch.cuda._utils import _cuda_load_module, _nvrtc_compile
+
+    binary, _ = _nvrtc_compile(source, names[0])
+    loaded: Any = _cuda_load_module(binary, names)
+    return {name: loaded[name].func for name in names}
 
 
 def transforms_are_active() -> bool:

@@ -23,7 +23,7 @@ from torchrl_caiac._sampling import all_finite, is_native
 from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flags
-from torchrl_caiac.transforms.checks import LateCheck
+from torchrl_caiac.transforms.checks import LateCheck, LateValue
 from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = ["BatchCheck", "CheckedScores"]
@@ -44,17 +44,20 @@ class CheckedScores(NamedTuple):
     Attributes:
         scores (torch.Tensor): ``[B * window, ...]``, NaN where they may not be used.
         unscored (torch.Tensor, optional): int64, the number of such rows, if counted.
-        is_wrong (torch.Tensor, optional): bool, whether a row has the score of another
-            state, or with lookahead is another one than the buffer drew; on
-            accelerators, where it is not read at once.
+        is_valid (torch.Tensor, optional): bool ``[B]`` or ``[B * window]``, the rows
+            with the scores of their states; on accelerators, where it is not read at
+            once.
         crosses (torch.Tensor, optional): bool ``[B, window - 1]``, the steps of windows
-            that are not steps of a trajectory.
+            that are not steps of a trajectory; on accelerators.
+        differs (torch.Tensor, optional): bool, with lookahead whether rows are others
+            than the buffer drew; on accelerators.
     """
 
     scores: torch.Tensor
-    unscored: torch.Tensor | None
-    is_wrong: torch.Tensor | None
-    crosses: torch.Tensor | None
+    unscored: torch.Tensor | None = None
+    is_valid: torch.Tensor | None = None
+    crosses: torch.Tensor | None = None
+    differs: torch.Tensor | None = None
 
 
 class BatchCheck:
@@ -131,8 +134,7 @@ class BatchCheck:
         if self.unscored == "keep":
             return self._kept(scores, is_valid, crosses)
         if LateCheck.needed(scores.device):
-            is_wrong = None if is_valid is None else ~is_valid.all()
-            return CheckedScores(scores, None, is_wrong, crosses)
+            return CheckedScores(scores, None, is_valid, crosses)
         if is_valid is None:
             # A sum is finite if all its terms are.
             if not math.isfinite(scores.sum().item()):
@@ -142,7 +144,7 @@ class BatchCheck:
         ):  # score_buffer has checked its scores
             self._explain_scores(scores)
             self._explain_fingerprints(is_valid)
-        return CheckedScores(scores, None, None, None)
+        return CheckedScores(scores)
 
     def after(
         self, td: TensorDictBase, checked: CheckedScores, states: Sequence[NestedKey]
@@ -171,7 +173,7 @@ class BatchCheck:
             if self.unscored == "raise":
                 self._explain_scores(checked.scores)
             self._explain_states(td, states)
-            names = [self.score_key, "fingerprints", "the windows", *states]
+            names = [self.score_key, "fingerprints", "the windows", "the rows", *states]
             raise ValueError(
                 f"{[names[place] for place in found]} were invalid in an earlier "
                 f"batch: {self.scores_name} or observations are NaN or infinite, "
@@ -180,16 +182,19 @@ class BatchCheck:
                 "end. On a CUDA device errors are late; sample the same "
                 "data on the CPU to find the rows"
             )
-        scores = checked.scores
-        if self.unscored == "keep":
-            scores = scores.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
-        zero = scores.new_zeros((), dtype=torch.float64)
-        flags = [
-            zero if flag is None else torch.where(flag.any(), math.nan, zero)
-            for flag in (checked.is_wrong, checked.crosses)
-        ]
-        sums = [leaf.sum(dtype=torch.float64) for leaf in (scores, *leaves)]
-        self._late.add(torch.stack([sums[0], *flags, *sums[1:]]))
+        is_valid, crosses, differs = checked[2:]
+        self._late.look(
+            [
+                LateValue(
+                    checked.scores,
+                    "infinite" if self.unscored == "keep" else "not finite",
+                ),
+                None if is_valid is None else LateValue(is_valid, "false"),
+                None if crosses is None else LateValue(crosses, "true"),
+                None if differs is None else LateValue(differs, "true"),
+                *map(LateValue, leaves),
+            ]
+        )
 
     # --- scores ----------------------------------------------------------------------
 
@@ -403,6 +408,6 @@ def _check_size(leaf: torch.Tensor, key: NestedKey | None, td: TensorDictBase) -
 
 def _is_finite(leaf: torch.Tensor) -> bool:
     if leaf.dtype is torch.float32 and is_native(leaf):
-        return all_finite(leaf)
+        return all_finite([leaf])
     # A sum is finite if all its terms are.
     return math.isfinite(leaf.sum().item())

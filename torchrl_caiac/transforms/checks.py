@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_caiac._sampling import is_native, look
 from torchrl_caiac.entities import EntityLayout
 
 __all__ = [
     "LateCheck",
+    "LateValue",
     "check_batch_shape",
     "check_choice",
     "check_generator",
@@ -150,6 +152,45 @@ def check_batch_shape(td: TensorDictBase, window: int) -> None:
 # --- values --------------------------------------------------------------------------
 
 
+class LateValue(NamedTuple):
+    """A tensor that :class:`LateCheck` looks at.
+
+    Attributes:
+        tensor (torch.Tensor): the values, contiguous.
+        bad (str): which values are bad: ``"not finite"``, ``"infinite"``, ``"false"``
+            or ``"true"``.
+        where (torch.Tensor, optional): bool, of the same size, the values that count;
+            all of them by default.
+    """
+
+    tensor: torch.Tensor
+    bad: Literal["not finite", "infinite", "false", "true"] = "not finite"
+    where: torch.Tensor | None = None
+
+    def summed(self) -> torch.Tensor:
+        """Returns a float64 that is not finite if a value is bad."""
+        values = self.tensor
+        if self.bad in ("false", "true"):
+            is_bad = values if self.bad == "true" else ~values
+            values = torch.where(is_bad, math.nan, 0.0)
+        if self.where is not None:
+            values = values.where(self.where, torch.zeros_like(values))
+        if self.bad == "infinite":
+            values = values.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf)
+        return values.sum(dtype=torch.float64)
+
+
+# Kinds of bad values, as in _sampling.cu.
+_KINDS = {
+    ("not finite", torch.float32): 0,
+    ("not finite", torch.float64): 1,
+    ("infinite", torch.float32): 3,
+    ("infinite", torch.float64): 4,
+    ("true", torch.bool): 5,
+    ("false", torch.bool): 6,
+}
+
+
 class LateCheck:
     """Finds values that are not finite on an accelerator, without waiting for it.
 
@@ -184,25 +225,58 @@ class LateCheck:
         """
         return device.type == "cuda"
 
+    def look(self, values: Sequence[LateValue | None]) -> None:
+        """Looks for bad values in the tensors of one batch, which stay on the device.
+
+        Args:
+            values (sequence of LateValue, optional): the tensors, of the same meaning
+                in every batch; ``None`` has no bad values.
+        """
+        there = [(place, value) for place, value in enumerate(values) if value]
+        if not there:
+            return
+        device = there[0][1].tensor.device
+        looked = [
+            (place, value.tensor, kind, value.where)
+            for place, value in there
+            if (kind := _KINDS.get((value.bad, value.tensor.dtype))) is not None
+        ]
+        tensors = [x for _, tensor, _, where in looked for x in (tensor, where)]
+        if (
+            device.type == "cuda"
+            and len(looked) == len(there)
+            and is_native(*(x for x in tensors if x is not None))
+        ):
+            sums, arrived = self._numbers(torch.Size([len(values)]), device)
+            look(sums, looked)
+            arrived.copy_(sums, non_blocking=True)
+            return
+        sums = torch.zeros(len(values), dtype=torch.float64, device=device)
+        for place, value in there:
+            sums[place] = value.summed()
+        self.add(sums)
+
     def add(self, values: torch.Tensor) -> None:
         """Adds the values of one batch.
 
         Args:
             values (torch.Tensor): ``[V]``, of the same meaning in every batch.
         """
-        known = self._sums
-        if known is None or (known[0].shape, known[0].device) != (
-            values.shape,
-            values.device,
-        ):
-            sums = torch.zeros_like(values, dtype=torch.float64)
-            arrived = torch.zeros(
-                values.shape, dtype=torch.float64, pin_memory=values.is_cuda
-            )
-            known = self._sums = sums, arrived
-        sums, arrived = known
+        sums, arrived = self._numbers(values.shape, values.device)
         sums += values
         arrived.copy_(sums, non_blocking=True)
+
+    def _numbers(
+        self, shape: torch.Size, device: torch.device
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        known = self._sums
+        if known is None or (known[0].shape, known[0].device) != (shape, device):
+            sums = torch.zeros(shape, dtype=torch.float64, device=device)
+            arrived = torch.zeros(
+                shape, dtype=torch.float64, pin_memory=device.type == "cuda"
+            )
+            known = self._sums = sums, arrived
+        return known
 
     def found(self) -> list[int]:
         """Returns and clears the places that were not finite in arrived batches.

@@ -482,9 +482,7 @@ class CounterfactualTransform(RandomTransform, ABC):
             locked, differs = self._locked(tensordict, self._lookahead)
             scores = hold_entities(scores, locked)
             if differs is not None and checked is not None:
-                wrong = checked.is_wrong
-                wrong = differs if wrong is None else wrong | differs
-                checked = checked._replace(is_wrong=wrong)
+                checked = checked._replace(differs=differs)
         if not self._free_share.is_done:
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)

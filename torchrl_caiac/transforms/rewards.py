@@ -15,7 +15,7 @@ from torchrl_caiac._keys import flatten
 from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import STEPS_KEY
-from torchrl_caiac.transforms.checks import LateCheck
+from torchrl_caiac.transforms.checks import LateCheck, LateValue
 from torchrl_caiac.transforms.goal_function import GoalFunction
 from torchrl_caiac.transforms.keys import TransformKeys
 
@@ -291,8 +291,9 @@ class GoalLeaves:
         # A sum is finite if all its terms are.
         if not is_late and math.isfinite(flat.sum().item()):
             return
-        flat = flat if where is None else flat.where(where, torch.zeros_like(flat))
         if not is_late:
+            if where is not None:
+                flat = flat.where(where, torch.zeros_like(flat))
             bad = ~flat.isfinite()
             if not bool(bad.any()):
                 return
@@ -309,7 +310,7 @@ class GoalLeaves:
                 "CUDA device errors are late; sample the same data on the CPU to find "
                 "the rows"
             )
-        self._late.add(flat.sum(dtype=torch.float64).unsqueeze(0))
+        self._late.look([LateValue(flat, "not finite", where)])
 
     def _end_flags(
         self,

@@ -22,7 +22,7 @@ from tensordict import (
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import join
-from torchrl_caiac._sampling import Runs, is_native, is_native_source, swap_rows
+from torchrl_caiac._sampling import Runs, is_native, swap_rows
 from torchrl_caiac._torchrl import leaf_of, with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
@@ -430,17 +430,19 @@ def _swapped(
     window: int,
     sources: Sequence[torch.Tensor] | None,
 ) -> dict[NestedKey, torch.Tensor] | None:
-    """Returns the new leaves, by C; ``None`` if these tensors need torch."""
+    """Returns the new leaves, by C or CUDA; ``None`` if these tensors need torch."""
     own = [values[leaf.place] for leaf in plan.leaves]
     found = own if sources is None else sources
+    if not own:
+        return {}
     donors, swapped = draw.donors.contiguous(), draw.swapped.contiguous()
-    if not is_native(donors, swapped, *own) or not is_native_source(*found):
+    if not is_native(donors, swapped, *own, sources=found):
         return None
     is_as_drawn = (
         (donors.dtype, swapped.dtype) == (torch.int64, torch.bool)
         and donors.shape == swapped.shape
         and donors.ndim == 2
-        and all(leaf.runs.last < swapped.shape[1] for leaf in plan.leaves)
+        and all(max(leaf.runs.owners) < swapped.shape[1] for leaf in plan.leaves)
         and all(len(value) >= len(swapped) * window for value in own)
         and all(
             (value.dtype, value.shape[1:]) == (source.dtype, source.shape[1:])
@@ -449,10 +451,9 @@ def _swapped(
     )
     if not is_as_drawn:  # the operations of torch say what is wrong
         return None
-    return {
-        leaf.key: swap_rows(value, source, leaf.runs, donors, swapped, window)
-        for leaf, value, source in zip(plan.leaves, own, found, strict=True)
-    }
+    runs = [leaf.runs for leaf in plan.leaves]
+    new = swap_rows(own, found, runs, donors, swapped, window)
+    return {leaf.key: value for leaf, value in zip(plan.leaves, new, strict=True)}
 
 
 @lru_cache(maxsize=64)

@@ -15,7 +15,7 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_below, draw_numbers
-from torchrl_caiac._sampling import is_native, is_native_source, read_columns
+from torchrl_caiac._sampling import is_native, read_columns
 from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
@@ -319,7 +319,7 @@ class FutureGoal(RandomTransform, SampleUnit):
             source, where = self.flat_source(data)
             numbers = source if rows is None else rows
             is_vector = rows is None or (rows.ndim, rows.dtype) == (1, torch.int64)
-            if is_vector and is_native_source(source) and is_native(numbers):
+            if is_vector and is_native(numbers, sources=[source]):
                 goals = read_columns(source, self._goal_columns[1], rows)
             elif rows is None:
                 goals = source.gather(1, where.expand(source.shape[0], -1))

@@ -1,0 +1,137 @@
+"""The kernels of ``_sampling.cu``: compiled once in a process, by NVRTC, and started.
+
+PyTorch comes with that compiler. Where it does not work, what calls :func:`is_there`
+uses operations of torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import struct
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_caiac._torchrl import compile_cuda
+
+__all__ = ["LEAVES", "address", "blocks", "is_there", "start"]
+
+_logger = logging.getLogger("torchrl_caiac")
+
+_SOURCE = Path(__file__).with_name("_sampling.cu")
+LEAVES = 16  # tensors that one start reads, as in the source
+THREADS = {"batch_donors": 512, "hindsight_sources": 512}  # of a block, by kernel
+_THREADS = 128
+_MOST_BLOCKS = 1024
+# The fields of each kernel's struct: q an integer or address, d a float64.
+_FIELDS = {
+    "state_matches": f"7q{3 * LEAVES}q",
+    "chosen_windows": "4q",
+    "batch_donors": "7qd6q",
+    "buffer_donors": "5qd9q",
+    "hindsight_sources": "4q3d2q",
+    "read_columns": "9q",
+    "swap_rows": f"6q{8 * LEAVES}q",
+    "look": f"q{5 * LEAVES}q",
+}
+_STRUCTS = {name: struct.Struct("=" + fields) for name, fields in _FIELDS.items()}
+
+
+def is_there(device: torch.device) -> bool:
+    """Returns whether the kernels can be used on a CUDA device.
+
+    Args:
+        device (torch.device): the device.
+
+    Returns:
+        bool: false for devices of other kinds, without the compiler, or with the
+        environment variable ``TORCHRL_CAIAC_NATIVE=0``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac._sampling_cuda import is_there
+        >>> is_there(torch.device("cpu"))
+        False
+    """
+    return device.type == "cuda" and _kernels(device.index) is not None
+
+
+def address(tensor: torch.Tensor | None) -> int:
+    """Returns where the numbers of a tensor are; 0 for ``None``."""
+    return 0 if tensor is None else tensor.data_ptr()
+
+
+def blocks(items: int) -> int:
+    """Returns a number of blocks for a number of items."""
+    return max(1, min(_MOST_BLOCKS, -(-items // _THREADS)))
+
+
+def start(
+    name: str,
+    device: torch.device,
+    grid: tuple[int, int],
+    fields: Sequence[int | float],
+) -> None:
+    """Starts a kernel on the current stream of a device.
+
+    Args:
+        name (str): the kernel.
+        device (torch.device): the device of all tensors.
+        grid (tuple of int): the numbers of blocks.
+        fields (sequence of int or float): the fields of its struct.
+
+    Raises:
+        RuntimeError: the driver refuses.
+    """
+    argument = ctypes.create_string_buffer(_STRUCTS[name].pack(*fields))
+    run(name, device, grid, argument)
+
+
+def run(name: str, device: torch.device, grid: tuple[int, int], argument: Any) -> None:
+    """Starts a kernel with its struct."""
+    kernels = _kernels(device.index)
+    assert kernels is not None  # is_there() is true
+    with torch.cuda.device(device):
+        error = _driver().cuLaunchKernel(
+            kernels[name],
+            *(*grid, 1),
+            *(THREADS.get(name, _THREADS), 1, 1),
+            0,
+            torch.cuda.current_stream(device).cuda_stream,
+            (ctypes.c_void_p * 1)(ctypes.addressof(argument)),
+            None,
+        )
+    if error:
+        raise RuntimeError(f"the CUDA driver refuses to start {name}: error {error}")
+
+
+@cache
+def _driver() -> ctypes.CDLL:
+    library = ctypes.CDLL("libcuda.so.1")
+    numbers = [ctypes.c_uint] * 7
+    pointers = [ctypes.c_void_p] * 3
+    library.cuLaunchKernel.argtypes = [ctypes.c_void_p, *numbers, *pointers]
+    return library
+
+
+@cache
+def _kernels(index: int | None) -> dict[str, Any] | None:
+    """Returns the compiled kernels, ``None`` if they cannot be compiled."""
+    if os.environ.get("TORCHRL_CAIAC_NATIVE") == "0":
+        return None
+    try:
+        _driver()
+        with torch.cuda.device(index):
+            return compile_cuda(_SOURCE.read_text(), list(_FIELDS))
+    except (AttributeError, ImportError, OSError, RuntimeError, TypeError) as error:
+        _logger.warning(
+            "sampling from a CUDA device is slower, as its kernels are not compiled: "
+            "%s",
+            error,
+        )
+        return None
