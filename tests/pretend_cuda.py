@@ -24,7 +24,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from torchrl_caiac import _sampling, _sampling_cuda
+from torchrl_caiac._sampling import native, on_cuda
 
 # Operations whose result, or its size, the host has to see.
 LOOKS = {
@@ -67,9 +67,9 @@ def pretend_cuda() -> Iterator[None]:
             mock.patch("torch.cuda._lazy_init"),
             mock.patch("torch.cuda.current_device", return_value=0),
             mock.patch("torch.cuda.synchronize"),
-            mock.patch.object(_sampling, "_PLAIN", {torch.Tensor, OnCuda}),
-            mock.patch.object(_sampling_cuda, "is_there", _is_there),
-            mock.patch.object(_sampling_cuda, "run", _run),
+            mock.patch.object(native, "PLAIN", {torch.Tensor, OnCuda}),
+            mock.patch.object(on_cuda, "is_there", _is_there),
+            mock.patch.object(on_cuda, "run", _run),
             torch.backends.cudnn.flags(enabled=False),
             _MadeOnCuda(),
         ):
@@ -90,7 +90,7 @@ def _run(name: str, device: torch.device, grid: tuple[int, int], argument: Any) 
 @cache
 def _kernels() -> Any:
     """Compiles the kernels for the CPU: a block has one thread, which does all."""
-    source = Path(_sampling_cuda.__file__).with_name("_sampling.cu")
+    source = Path(on_cuda.__file__).with_name("sampling.cu")
     names = re.findall(r"__global__ void (\w+)\(const (\w+) a\)", source.read_text())
     text = f"""
         struct Index {{ unsigned x, y, z; }};

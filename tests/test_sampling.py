@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_caiac import EntityLayout, _sampling_c
+from torchrl_caiac import EntityLayout
 from torchrl_caiac._fingerprints import fingerprint, matches, state_hash
 from torchrl_caiac._sampling import (
     Runs,
@@ -24,6 +25,7 @@ from torchrl_caiac._sampling import (
     read_columns,
     swap_rows,
 )
+from torchrl_caiac._sampling.on_cpu import library
 from torchrl_caiac.transforms import HindsightGoal
 from torchrl_caiac.transforms.checks import LateCheck, LateValue
 from torchrl_caiac.transforms.draws import (
@@ -32,7 +34,9 @@ from torchrl_caiac.transforms.draws import (
     draw_batch_donors,
     draw_buffer_donors,
     draw_windows,
+    uninfluenced,
 )
+from torchrl_caiac.transforms.goals.hindsight import HindsightDraw
 from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
 
 KINDS = [torch.float32, torch.float64, torch.float16, torch.uint8, torch.int64]
@@ -385,13 +389,13 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     yield tmp_path / "torchrl_caiac"
     monkeypatch.undo()
-    _sampling_c.library.cache_clear()
+    library.cache_clear()
     assert is_native()
 
 
 def is_native_anew() -> bool:
     """What a new process finds."""
-    _sampling_c.library.cache_clear()
+    library.cache_clear()
     return is_native()
 
 
@@ -525,3 +529,72 @@ def test_leaves_without_columns(window: int) -> None:
         lambda: apply_swap(td, plan, values, draw, window=window, sources=sources)
     ):
         assert torch.equal(batch["b"], state[:window].repeat(4 // window, 1))
+
+
+@DEVICES
+@given(
+    rows=st.integers(1, 9),
+    columns=st.permutations(range(5)),
+    number=st.integers(1, 5),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    has_future=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_goals_of_rows(
+    device: str,
+    rows: int,
+    columns: list[int],
+    number: int,
+    dtype: torch.dtype,
+    has_future: bool,
+    seed: int,
+) -> None:
+    names = ["abcde"[column] for column in columns[:number]]
+    layout = EntityLayout(
+        {name: [i] for i, name in enumerate("abcde")},
+        goal={name: [names.index(name)] if name in names else [] for name in "abcde"},
+        achieved={name: [i] if name in names else [] for i, name in enumerate("abcde")},
+    )
+    goals = HindsightGoal(
+        layout, lambda achieved, desired: -(achieved - desired).sum(-1)
+    )
+    of = torch.Generator().manual_seed(seed)
+
+    def values(width: int) -> torch.Tensor:
+        return torch.rand(rows, width, generator=of).to(device, dtype)
+
+    td = TensorDict(
+        {
+            "desired_goal": values(number),
+            "next": {"observation": values(5), "reward": values(1)},
+        },
+        [rows],
+    )
+    source = torch.randint(0, (3 if has_future else 2) * rows, (rows,), generator=of)
+    future = {"desired_goal": values(number)} if has_future else None
+    draw = HindsightDraw(source.to(device), future)
+    native, by_torch = both(lambda: goals.apply_parameters(td, draw), device)
+    for key in ("desired_goal", ("next", "reward"), ("hindsight", "relabeled")):
+        assert bits(native[key]) == bits(by_torch[key])
+
+
+@DEVICES
+@given(
+    windows=st.integers(1, 6),
+    window=st.integers(1, 4),
+    threshold=st.sampled_from([0.0, 0.05, 1e300, math.inf]),
+    each=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_uninfluenced_entities(
+    device: str, windows: int, window: int, threshold: float, each: bool, seed: int
+) -> None:
+    of = torch.Generator().manual_seed(seed)
+    scores = torch.rand(windows * window, 3, generator=of)
+    scores[scores > 0.7] = 0.05
+    scores[scores > 0.6] = math.nan
+    limit: float | torch.Tensor = threshold
+    if each:
+        limit = torch.tensor([threshold, math.nan, 0.3]).to(device)
+    scores = scores.to(device)
+    assert torch.equal(*both(lambda: uninfluenced(scores, limit, window), device))

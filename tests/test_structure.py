@@ -13,6 +13,7 @@ PACKAGE = Path(torchrl_caiac.__file__).parent
 # Each may import those before it and those of its own layer.
 LAYERS = [
     {
+        "_batches",
         "_buffer_transform",
         "_checks",
         "_column_motion",

@@ -27,6 +27,7 @@ from torchrl.objectives import LossModule
 
 import torchrl_caiac
 from torchrl_caiac import _torchrl as fence
+from torchrl_caiac._batches import rows_of, with_leaves
 from torchrl_caiac._torchrl import sampled_rows, sampling_buffer
 from torchrl_caiac.trajectories import flat_rows
 
@@ -294,21 +295,21 @@ def test_with_leaves_is_a_copy_with_leaves(kind, device):
     wanted, before = td.copy(), td.clone()
     for key, leaf in leaves.items():
         wanted.set(key, leaf)
-    out = fence.with_leaves(td, leaves)
+    out = with_leaves(td, leaves)
     assert set(out.keys(True, True)) == set(wanted.keys(True, True))
     assert (out == wanted).all() and (td == before).all()
     assert type(out) is type(wanted) and out.names == wanted.names
     assert out.device == wanted.device and not out.is_locked
     assert all(out.get(key) is leaves[key] for key in keys if kind == "plain")
     with pytest.raises(RuntimeError, match="batch dimension"):
-        fence.with_leaves(td, {("next", "a"): torch.ones(3)})
+        with_leaves(td, {("next", "a"): torch.ones(3)})
 
 
 @KINDS
 def test_rows_of_are_those_of_an_index(kind):
     td = batch_of(kind)
     picked = torch.tensor([1, 0, 1])
-    wanted, found = td[picked], fence.rows_of(td, picked)
+    wanted, found = td[picked], rows_of(td, picked)
     assert set(found.keys(True)) == set(wanted.keys(True))
     assert (found == wanted).all() and found.batch_size == wanted.batch_size
     assert type(found) is type(wanted) and found.names == wanted.names

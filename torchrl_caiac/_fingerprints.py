@@ -24,11 +24,13 @@ __all__ = [
     "fingerprint",
     "fingerprint_key",
     "is_fingerprint_of",
+    "leaf_weights",
     "matches",
     "rows_with_fingerprints",
     "settings_of",
     "state_hash",
     "state_leaves",
+    "upper_half",
 ]
 
 _MASK = (1 << 64) - 1
@@ -124,7 +126,7 @@ def fingerprint(
         >>> settings_of(known, state, after)
         tensor([3, 3])
     """
-    upper = _upper_half(tuple(names)) << 32
+    upper = upper_half(tuple(names)) << 32
     return _joint(state, after) + upper + (settings & 0xFFFFFFFF)
 
 
@@ -158,7 +160,7 @@ def matches(
         for number, leaf in enumerate(state_leaves(td, entries)):
             leaf = leaf if rows is None else leaf.index_select(0, rows)
             left = left - _weighted(_lanes(leaf), number, factor)
-    return left >> 32 == _upper_half(tuple(names))
+    return left >> 32 == upper_half(tuple(names))
 
 
 def _matched(
@@ -186,7 +188,7 @@ def _matched(
         numbers[-1], sources=[known, *leaves]
     ):
         return None
-    return state_matches(leaves, weights, known, _upper_half(tuple(names)), rows)
+    return state_matches(leaves, weights, known, upper_half(tuple(names)), rows)
 
 
 def _is_row_of_floats(leaf: torch.Tensor) -> bool:
@@ -200,7 +202,7 @@ def is_fingerprint_of(
     names: Sequence[str],
 ) -> torch.Tensor:
     """Returns which rows still have the states of their fingerprints, bool ``[B]``."""
-    return (known - _joint(state, after)) >> 32 == _upper_half(tuple(names))
+    return (known - _joint(state, after)) >> 32 == upper_half(tuple(names))
 
 
 def settings_of(
@@ -242,10 +244,16 @@ def rows_with_fingerprints(
 
 
 @lru_cache(maxsize=256)
-def _upper_half(names: tuple[str, ...]) -> int:
+def upper_half(names: tuple[str, ...]) -> int:
     """Returns the upper half of a fingerprint less the hash of its states.
 
     So that no score is used for another entity. The lower half is the settings.
+
+    Args:
+        names (tuple of str): the entities, in the order of the scores.
+
+    Returns:
+        int: the number, at least 0.
     """
     digest = hashlib.sha256("\0".join(names).encode()).digest()
     return int.from_bytes(digest[:4], "big") >> 1  # not negative
@@ -300,6 +308,20 @@ def _weighted(lanes: torch.Tensor, number: int, factor: int) -> torch.Tensor:
     if lanes.device.type == "cpu":
         return torch.mv(lanes, weights)
     return (lanes * weights).sum(-1)  # integers have no products on other devices
+
+
+def leaf_weights(width: int, number: int, device: torch.device) -> torch.Tensor:
+    """Returns the weights of the values of a leaf in the hash of its state.
+
+    Args:
+        width (int): the values in a row.
+        number (int): the place of the leaf in the state.
+        device (torch.device): the device of the result.
+
+    Returns:
+        torch.Tensor: int64 ``[width]``; do not write to it.
+    """
+    return _weights(width, number, 1, device)
 
 
 @lru_cache(maxsize=256)

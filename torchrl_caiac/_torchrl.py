@@ -8,13 +8,12 @@ and that no other module uses such a name.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 from tensordict import (
-    MemoryMappedTensor,
     TensorDict,
     TensorDictBase,
     is_tensor_collection,
@@ -36,6 +35,7 @@ __all__ = [
     "compile_cuda",
     "drop_memmap_leaf",
     "drop_prefetched",
+    "entries_of",
     "file_name",
     "forget_leaves",
     "is_in_another_process",
@@ -46,10 +46,10 @@ __all__ = [
     "loss_masks",
     "mark_memmap",
     "memmap_folder",
+    "names_of",
     "packed_linear",
     "priority_weight",
     "reduce_loss",
-    "rows_of",
     "sampled_rows",
     "sampling_buffer",
     "set_memmap_entry",
@@ -58,9 +58,9 @@ __all__ = [
     "storage_revision",
     "storage_rows",
     "tensor_version",
+    "tensordict_of",
     "transforms_are_active",
     "vmap_loss",
-    "with_leaves",
     "without_generator",
     "writes_paused",
 ]
@@ -387,71 +387,25 @@ def leaf_of(td: TensorDictBase, key: NestedKey) -> Any:
     return node if type(node) is Tensor else td.get(key, None)
 
 
-def with_leaves(
-    td: TensorDictBase, leaves: Mapping[NestedKey, Tensor]
-) -> TensorDictBase:
-    """Returns a shallow copy of a tensordict with other leaves.
-
-    The same as ``copy`` and ``set``, in a third of the time.
-
-    Args:
-        td (TensorDictBase): the tensordict, ``[*B]``; it is not changed.
-        leaves (mapping of NestedKey to torch.Tensor): the leaves, ``[*B, ...]``.
-
-    Returns:
-        TensorDictBase: the copy.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_caiac._torchrl import with_leaves
-        >>> td = TensorDict({"a": torch.zeros(2), "b": {"c": torch.zeros(2)}}, [2])
-        >>> with_leaves(td, {("b", "c"): torch.ones(2)})["b", "c"]
-        tensor([1., 1.])
-    """
-    out = _shallow(td)
-    shape, device = td.batch_size, td.device
-    for key, leaf in leaves.items():
-        *parents, name = (key,) if isinstance(key, str) else key
-        node = out
-        for parent in parents:
-            node = node._tensordict.get(parent) if type(node) is TensorDict else None
-        if (
-            type(node) is TensorDict
-            and leaf.shape[: len(shape)] == shape == node.batch_size
-            and (device is None or leaf.device == device)
-        ):
-            node._tensordict[name] = leaf
-        else:
-            out.set(key, leaf)
-    return out
+def entries_of(td: Any) -> dict[str, Any] | None:
+    """Returns the entries of a tensordict, not copied; ``None`` for other classes."""
+    return td._tensordict if type(td) is TensorDict else None
 
 
-def _shallow(td: Any) -> Any:
-    if type(td) is not TensorDict:
-        return td.copy()
-    entries = {
-        name: entry
-        if isinstance(entry, Tensor) or not is_tensor_collection(entry)
-        else _shallow(entry)
-        for name, entry in td._tensordict.items()
-    }
-    return _node(td, entries, td.batch_size)
+def tensordict_of(
+    entries: dict[str, Any],
+    size: torch.Size,
+    device: torch.device | None,
+    names: list[str] | None = None,
+) -> TensorDict:
+    """Returns a tensordict of entries that are known to fit, without checking them."""
+    return TensorDict._new_unsafe(entries, size, device=device, names=names)
 
 
-def _node(td: TensorDict, entries: dict[str, Any], size: torch.Size) -> TensorDict:
-    names = td._maybe_names()
-    return TensorDict._new_unsafe(entries, size, device=td.device, names=names)
-
-
-def rows_of(td: Any, rows: Tensor) -> Any:
-    """Returns ``td[rows]``, int64 ``[B]``, not negative, in half of the time."""
-    if type(td) in (Tensor, MemoryMappedTensor):
-        return td.as_subclass(Tensor).index_select(0, rows)
-    if type(td) is not TensorDict:
-        return td[rows]
-    entries = {name: rows_of(entry, rows) for name, entry in td._tensordict.items()}
-    return _node(td, entries, torch.Size([len(rows), *td.batch_size[1:]]))
+def names_of(td: TensorDict) -> list[str] | None:
+    """Returns the names of the dimensions, ``None`` if they have none."""
+    names: list[str] | None = td._maybe_names()
+    return names
 
 
 def lazy_rows(td: TensorDictBase, rows: Tensor) -> TensorDictBase:

@@ -21,6 +21,7 @@ __all__ = [
     "COLLECTOR_KEY",
     "STEPS_KEY",
     "TrajectoryIndex",
+    "end_flag_keys",
     "end_flags",
     "flat_rows",
     "trajectory_index",
@@ -236,6 +237,33 @@ def trajectory_index(
     return _ordered(row, ends, oldest * streams)
 
 
+def end_flag_keys(data: TensorDictBase, done_key: NestedKey | None) -> list[NestedKey]:
+    """Returns the keys of the flags that end a trajectory.
+
+    Args:
+        data (TensorDictBase): transitions ``[T]``.
+        done_key (NestedKey, optional): the end flags, ``None`` for none. If the data
+            lack them, they are ``"terminated"`` and ``"truncated"`` beside this key.
+
+    Returns:
+        list of NestedKey: those that the data have.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac.trajectories import end_flag_keys
+        >>> data = TensorDict({"next": {"truncated": torch.zeros(2, 1)}}, [2])
+        >>> end_flag_keys(data, ("next", "done"))
+        [('next', 'truncated')]
+    """
+    if done_key is None:
+        return []
+    if data.get(done_key, None) is not None:
+        return [done_key]
+    parts = [(*path(done_key)[:-1], name) for name in _PARTS_OF_DONE]
+    return [key for key in parts if data.get(key, None) is not None]
+
+
 def end_flags(
     data: TensorDictBase, done_key: NestedKey, length: int | None = None
 ) -> torch.Tensor | None:
@@ -263,15 +291,10 @@ def end_flags(
         tensor([False,  True])
     """
     length = len(data) if length is None else length
-    found = data.get(done_key, None)
-    done = None if found is None else _flat(found, length, done_key).bool()
-    if found is None:
-        parents = path(done_key)[:-1]
-        for name in _PARTS_OF_DONE:
-            part = data.get((*parents, name), None)
-            if part is not None:
-                flags = _flat(part, length, (*parents, name)).bool()
-                done = flags if done is None else done | flags
+    done: torch.Tensor | None = None
+    for key in end_flag_keys(data, done_key):
+        flags = _flat(data.get(key), length, key).bool()
+        done = flags if done is None else done | flags
     steps = data.get(STEPS_KEY, None)
     if done is not None and steps is not None:
         done = done & (_flat(steps, length, STEPS_KEY) == 1)

@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 
+from torchrl_caiac._batches import rows_of
 from torchrl_caiac._torchrl import (
     lazy_rows,
-    rows_of,
     sampling_buffer,
     storage_data,
 )

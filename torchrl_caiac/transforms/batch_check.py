@@ -135,11 +135,11 @@ class BatchCheck:
             return self._kept(scores, is_valid, crosses)
         if LateCheck.needed(scores.device):
             return CheckedScores(scores, None, is_valid, crosses)
-        if is_valid is None:
+        if known is None:
             # A sum is finite if all its terms are.
             if not math.isfinite(scores.sum().item()):
                 self._explain_scores(scores)
-        elif not torch.equal(
+        elif is_valid is not None and not torch.equal(
             is_valid, _true(len(is_valid))
         ):  # score_buffer has checked its scores
             self._explain_scores(scores)
@@ -163,7 +163,7 @@ class BatchCheck:
         leaves = [leaf_of(td, key) for key in states]
         if not LateCheck.needed(checked.scores.device):
             if not all(map(_is_finite, leaves)):
-                self._explain_states(td, states)
+                self.explain_states(td, states)
             return
         found = self._late.found()
         if found:
@@ -172,7 +172,7 @@ class BatchCheck:
                 self._explain_windows(td, checked.crosses)
             if self.unscored == "raise":
                 self._explain_scores(checked.scores)
-            self._explain_states(td, states)
+            self.explain_states(td, states)
             names = [self.score_key, "fingerprints", "the windows", "the rows", *states]
             raise ValueError(
                 f"{[names[place] for place in found]} were invalid in an earlier "
@@ -369,7 +369,16 @@ class BatchCheck:
 
     # --- states ----------------------------------------------------------------------
 
-    def _explain_states(self, td: TensorDictBase, states: Sequence[NestedKey]) -> None:
+    def explain_states(self, td: TensorDictBase, states: Sequence[NestedKey]) -> None:
+        """Raises if a value of a state is not finite.
+
+        Args:
+            td (TensorDictBase): the batch after swapping.
+            states (sequence of NestedKey): the floating-point leaves of its states.
+
+        Raises:
+            ValueError: it names the leaf and the row.
+        """
         for key in states:
             bad = ~td.get(key).isfinite()
             if bad.any():

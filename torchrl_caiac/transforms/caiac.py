@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import torch
@@ -186,8 +187,8 @@ class CAIACTransform(CounterfactualTransform):
             keys=keys,
             check=check,
         )
-        self._any_fixed = bool(layout.fixed)
-        self._swappable = ~layout.fixed_mask
+        # The limits of all entities, and what they were made from.
+        self._limits: tuple[float | torch.Tensor, torch.Tensor] | None = None
 
     def swappable(self, scores: torch.Tensor) -> torch.Tensor:
         """Returns the entities of each window that may be swapped (section 3.3, eq. 1).
@@ -198,9 +199,20 @@ class CAIACTransform(CounterfactualTransform):
         Returns:
             torch.Tensor: bool ``[B, N]``, never true for ``fixed`` entities.
         """
-        free = uninfluenced(scores, self._thresholds.limit(scores), self.window)
-        if self._any_fixed:
-            if self._swappable.device != free.device:
-                self._swappable = self._swappable.to(free.device)
-            free = free & self._swappable
-        return free
+        limit = self._thresholds.limit(scores)
+        known = self._limits
+        dtype = scores.dtype if scores.is_floating_point() else torch.float32
+        if (
+            known is None
+            or known[0] is not limit
+            or (known[1].device, known[1].dtype) != (scores.device, dtype)
+        ):
+            numbers = limit
+            if not isinstance(numbers, torch.Tensor):
+                numbers = torch.tensor(limit, dtype=torch.float64)
+                numbers = numbers.to(scores.device, dtype).expand(len(self.layout))
+            # No score is at most NaN.
+            fixed = self.layout.fixed_mask.to(scores.device)
+            numbers = numbers.masked_fill(fixed, math.nan)
+            known = self._limits = limit, numbers
+        return uninfluenced(scores, known[1], self.window)

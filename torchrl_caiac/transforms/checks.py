@@ -21,6 +21,7 @@ __all__ = [
     "check_generator",
     "check_layout",
     "check_number",
+    "check_relabeled_rows",
     "check_window",
 ]
 
@@ -146,6 +147,34 @@ def check_batch_shape(td: TensorDictBase, window: int) -> None:
         raise ValueError(
             f"the batch has shape {list(td.shape)}, whose last dimension is not a "
             f"multiple of the window {window}: sample whole windows from each buffer"
+        )
+
+
+def check_relabeled_rows(
+    relabeled: int, kept: int, rows: int, name: str, ratio: float
+) -> None:
+    """Raises if a :class:`~torchrl.data.HERReplayBuffer` relabels counterfactual rows.
+
+    Args:
+        relabeled (int): the first rows of a batch, which the buffer relabels.
+        kept (int): the first rows, which are not counterfactual.
+        rows (int): the rows of the batch.
+        name (str): the transform.
+        ratio (float): its share of counterfactual rows.
+
+    Raises:
+        RuntimeError: it does.
+
+    Examples:
+        >>> from torchrl_caiac.transforms.checks import check_relabeled_rows
+        >>> check_relabeled_rows(4, 5, 10, "CAIACTransform", 0.5)
+    """
+    if relabeled > kept:
+        raise RuntimeError(
+            f"HERReplayBuffer relabels the first {relabeled} of {rows} rows of each "
+            "batch after all transforms, and some of them may be counterfactual: pass "
+            f"rows='last' to {name}, and a her_ratio of at most 1 - "
+            f"counterfactual_ratio = {1 - ratio:g}"
         )
 
 

@@ -28,10 +28,11 @@ from torchrl_caiac.transforms.checks import (
     check_generator,
     check_layout,
     check_number,
+    check_relabeled_rows,
     check_window,
 )
 from torchrl_caiac.transforms.donors import BufferDonors
-from torchrl_caiac.transforms.draws import SwapDraw, draw_windows
+from torchrl_caiac.transforms.draws import SwapDraw, draw_batch_donors, draw_windows
 from torchrl_caiac.transforms.free_share import FreeShare
 from torchrl_caiac.transforms.goals.window import WindowGoal
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -41,6 +42,7 @@ from torchrl_caiac.transforms.lookahead import (
     check_lookahead,
     hold_entities,
 )
+from torchrl_caiac.transforms.repeated_swap import RepeatedSwap, SwapSettings
 from torchrl_caiac.transforms.rewards import (
     GoalLeaves,
     RewardFn,
@@ -178,6 +180,7 @@ class CounterfactualTransform(RandomTransform, ABC):
             unscored=self.unscored,
         )
         self._free_share = FreeShare(layout)
+        self._repeated: RepeatedSwap | None = None
         self._no_donor = torch.zeros(len(layout), dtype=torch.int64)
         self._unscored = torch.zeros((), dtype=torch.int64)
         swapped = self._planner.keys
@@ -417,11 +420,9 @@ class CounterfactualTransform(RandomTransform, ABC):
             out = self._donors[0].apply(td, plan, values, draw)
         else:
             out = apply_swap(td, plan, values, draw, window=self.window)
-        keys, swapped = self.keys, draw.swapped
-        total, window = td.shape[0], self.window
+        swapped, chosen, window = draw.swapped, draw.chosen, self.window
         drawn = swapped.shape[0]
-        first = total - drawn * window
-        chosen = draw.chosen
+        first = td.shape[0] - drawn * window
         if window > 1:
             swapped = swapped.unsqueeze(1).expand(-1, window, -1).flatten(0, 1)
             if chosen is not None:
@@ -438,8 +439,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             kept = swapped.new_zeros(first, swapped.shape[-1])
             swapped = torch.cat([kept, swapped])
             chosen = torch.cat([kept[:, :1], chosen])
-        out.set(keys.counterfactual, chosen)
-        out.set(keys.swapped, swapped)
+        out.set(self.keys.counterfactual, chosen)
+        out.set(self.keys.swapped, swapped)
         return out
 
     # --- the transform ---------------------------------------------------------------
@@ -465,8 +466,21 @@ class CounterfactualTransform(RandomTransform, ABC):
                 another state.
         """
         self.warn_if_forked()
-        self._check_buffer(tensordict)
+        self._check_buffer(tensordict.batch_size)
         shape = tensordict.batch_size
+        if self._repeated is not None and self._repeated.settings == self._settings:
+            done = self._repeated(
+                tensordict,
+                self.swappable,
+                self.num_counterfactual(shape[:1].numel() // self.window),
+                rows=self.chosen_rows,
+                swap_prob=self.swap_prob,
+                no_donor=self._no_donor,
+                generator=self.generator,
+                batch_check=self._batch_check,
+            )
+            if done is not None:
+                return done
         if len(shape) != 1:
             check_batch_shape(tensordict, self.window)
             tensordict = tensordict.reshape(-1)
@@ -493,13 +507,24 @@ class CounterfactualTransform(RandomTransform, ABC):
         if checked is not None:
             self._batch_check.after(out, checked, plan.states)
             if checked.unscored is not None:
-                if self._unscored.device != scores.device:
-                    self._unscored = self._unscored.to(scores.device)
+                self._unscored = self._unscored.to(scores.device)
                 self._unscored.add_(checked.unscored)
-        if self._no_donor.device != draw.no_donor.device:
-            self._no_donor = self._no_donor.to(draw.no_donor.device)
+        self._no_donor = self._no_donor.to(draw.no_donor.device)
         self._no_donor.add_(draw.no_donor)
+        if self._free_share.is_done:
+            self._repeated = RepeatedSwap.of(
+                tensordict, plan, self.layout, self._settings, self._repeated
+            )
         return out if len(shape) == 1 else out.reshape(shape)
+
+    @property
+    def _settings(self) -> SwapSettings | None:
+        """The settings of repeated swaps, ``None`` if all are done step by step."""
+        if self._donors or self._goal_leaves or self._lookahead is not None:
+            return None
+        if self.unscored == "keep" or self.draw_in_batch is not draw_batch_donors:
+            return None
+        return SwapSettings(self.window, self.score_key, self.keys, self.check)
 
     def _locked(
         self, td: TensorDictBase, lookahead: Lookahead
@@ -514,25 +539,16 @@ class CounterfactualTransform(RandomTransform, ABC):
             )
         return lookahead.locked(*found, td)
 
-    def _check_buffer(self, td: TensorDictBase) -> None:
+    def _check_buffer(self, shape: torch.Size) -> None:
         """Raises if the buffer will relabel counterfactual rows of the batch."""
         buffer = sampling_buffer()
-        if not isinstance(buffer, HERReplayBuffer) or not td.batch_size:
-            return
-        rows = td.batch_size[0]
-        relabeled = int(rows * buffer.her_ratio)
-        kept = 0  # the first rows, which are never counterfactual
-        if self.chosen_rows == "last" or self.counterfactual_ratio == 0:
-            windows = rows // self.window
-            kept = (windows - self.num_counterfactual(windows)) * self.window
-        if relabeled > kept:
-            raise RuntimeError(
-                f"HERReplayBuffer relabels the first {relabeled} of {rows} rows of "
-                "each batch after all transforms, and some of them may be "
-                f"counterfactual: pass rows='last' to {type(self).__name__}, and a "
-                "her_ratio of at most 1 - counterfactual_ratio = "
-                f"{1 - self.counterfactual_ratio:g}"
-            )
+        if isinstance(buffer, HERReplayBuffer) and shape:
+            rows, kept = shape[0], 0  # the first rows are never counterfactual
+            if self.chosen_rows == "last" or self.counterfactual_ratio == 0:
+                windows = rows // self.window
+                kept = (windows - self.num_counterfactual(windows)) * self.window
+            name, ratio = type(self).__name__, self.counterfactual_ratio
+            check_relabeled_rows(int(rows * buffer.her_ratio), kept, rows, name, ratio)
 
     def _scores(self, td: TensorDictBase) -> torch.Tensor:
         if not td.shape[0]:
@@ -553,8 +569,7 @@ class CounterfactualTransform(RandomTransform, ABC):
             )
         scores = leaf_of(td, self.score_key)
         if scores is None:
-            donors = self.donors_class
-            where = "on the replay buffer"
+            donors, where = self.donors_class, "on the replay buffer"
             if isinstance(sampling_buffer(), ReplayBufferEnsemble):
                 where = "on each buffer of the ensemble"
             raise KeyError(

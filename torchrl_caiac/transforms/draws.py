@@ -18,6 +18,7 @@ from torchrl_caiac._sampling import (
     batch_donors,
     buffer_donors,
     chosen_windows,
+    free_windows,
     is_native,
 )
 from torchrl_caiac.transforms.indexing import pick_rows, window_max, window_starts
@@ -30,6 +31,7 @@ __all__ = [
     "draw_buffer_donors",
     "draw_windows",
     "uninfluenced",
+    "window_numbers",
 ]
 
 
@@ -186,7 +188,64 @@ def uninfluenced(
         tensor([[ True],
                 [False]])
     """
+    if (
+        scores.ndim == 2
+        and scores.dtype is torch.float32
+        and not len(scores) % window
+        and is_native(scores)
+    ):
+        limits = _limits(threshold, scores.device)
+        if (
+            limits.dtype is torch.float32
+            and limits.shape in ((), scores.shape[1:])
+            and is_native(limits)
+        ):
+            return free_windows(scores, limits, window)
     return window_max(scores, window) <= threshold
+
+
+def _limits(threshold: float | torch.Tensor, device: torch.device) -> torch.Tensor:
+    if isinstance(threshold, torch.Tensor):
+        return threshold
+    return _number(float(threshold), device)
+
+
+@lru_cache(maxsize=64)
+def _number(number: float, device: torch.device) -> torch.Tensor:
+    return torch.tensor(number, dtype=torch.float64).to(device, torch.float32)
+
+
+def window_numbers(
+    windows: int, *, device: torch.device, generator: torch.Generator | None = None
+) -> torch.Tensor:
+    """Draws what decides which windows of a batch become counterfactual.
+
+    Args:
+        windows (int): the number of windows in the batch, ``B``.
+
+    Keyword Args:
+        device (torch.device): the device of the result.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        torch.Tensor: a permutation, int64 ``[B]``; or, if they are drawn on a CUDA
+        device, where this takes fewer operations, numbers below 1, float64 ``[B]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.draws import window_numbers
+        >>> sorted(window_numbers(3, device=torch.device("cpu")).tolist())
+        [0, 1, 2]
+    """
+    if device.type == "cuda" and (generator is None or generator.device == device):
+        return draw_numbers(
+            torch.rand,
+            (windows,),
+            device=device,
+            generator=generator,
+            dtype=torch.float64,
+        )
+    return draw_numbers(torch.randperm, windows, device=device, generator=generator)
 
 
 def draw_windows(
@@ -215,26 +274,15 @@ def draw_windows(
         >>> draw_windows(9, 4, device=torch.device("cpu")).sum()
         tensor(4)
     """
-    if device.type == "cuda" and (generator is None or generator.device == device):
-        # The same distribution by fewer operations than a permutation takes there.
-        number = draw_numbers(
-            torch.rand,
-            (windows,),
-            device=device,
-            generator=generator,
-            dtype=torch.float64,
-        )
-        if windows <= _MOST_RANKED and is_native(number):
-            return chosen_windows(number, count)
-        order = number.argsort(stable=True).argsort()
-    else:
-        order = draw_numbers(
-            torch.randperm, windows, device=device, generator=generator
-        )
-    return order < count
+    number = window_numbers(windows, device=device, generator=generator)
+    if number.dtype is torch.int64:
+        return number < count
+    if windows <= _MOST_RANKED and is_native(number):
+        return chosen_windows(number, count)
+    return number.argsort(stable=True).argsort() < count
 
 
-# Windows that are compared with each other by a kernel.
+# Windows that are compared with each other by a kernel, at most.
 _MOST_RANKED = 8192
 
 

@@ -21,9 +21,10 @@ from tensordict import (
 )
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._batches import with_leaves
 from torchrl_caiac._keys import join
 from torchrl_caiac._sampling import Runs, is_native, swap_rows
-from torchrl_caiac._torchrl import leaf_of, with_leaves
+from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.transforms.draws import SwapDraw

@@ -179,6 +179,11 @@ class FutureGoal(RandomTransform, SampleUnit):
         return [key for key in self.layout.goal.values() if key is not None]
 
     @property
+    def goal_columns(self) -> tuple[int, ...]:
+        """The columns of the leaf that the goals of a flat layout are read from."""
+        return tuple(self._goal_columns[1])
+
+    @property
     def achieved_keys(self) -> list[NestedKey]:
         """The leaves, of the next state, that goals are read from."""
         if self.layout.is_flat:

@@ -9,10 +9,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._batches import with_leaves
 from torchrl_caiac._keys import floating
 from torchrl_caiac._random import draw_numbers
-from torchrl_caiac._sampling import hindsight_sources, is_native
-from torchrl_caiac._torchrl import leaf_of, with_leaves
+from torchrl_caiac._sampling import hindsight_sources, is_native, relabel_rows
+from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_number
@@ -317,8 +318,54 @@ class HindsightGoal(FutureGoal):
 
     def _relabel(self, td: TensorDictBase, draw: HindsightDraw) -> Goals:
         """Returns the leaves that a draw changes or adds."""
-        relabeled = (draw.source >= td.shape[0]).unsqueeze(-1)
         flags = leaf_of(td, self.keys.counterfactual)
+        found = self._relabel_vectors(td, draw) if self.layout.is_flat else None
+        goals: Goals = {}
+        if found is None:
+            goals, reached, relabeled = self._relabel_leaves(td, draw)
+            desired = _vector(goals)
+        else:
+            desired, reached, relabeled = found
+            goals[self.layout.desired_goal_key] = desired
+        is_new = relabeled if flags is None else relabeled | flags
+        leaves = self._goal_leaves(td, reached, desired, where=is_new.reshape(-1))
+        after = {self.layout.next(key): goal for key, goal in goals.items()}
+        return {
+            **goals,
+            **{k: goal for k, goal in after.items() if leaf_of(td, k) is not None},
+            **leaves,
+            self.keys.relabeled: relabeled,
+        }
+
+    def _relabel_vectors(
+        self, td: TensorDictBase, draw: HindsightDraw
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None:
+        """Returns goals, achieved goals and which are new, in C or CUDA.
+
+        ``None`` if these data need torch.
+        """
+        key = self.layout.desired_goal_key
+        values, _ = self.flat_source(td)
+        desired = leaf_of(td, key)
+        future = None if draw.future is None else draw.future[key]
+        columns = self.goal_columns
+        goals = [x for x in (desired, future) if x is not None]
+        wanted = len(values), len(columns)
+        if (
+            desired is None
+            or draw.source.dtype is not torch.int64
+            or draw.source.shape != values.shape[:1]
+            or any((x.shape, x.dtype) != (wanted, values.dtype) for x in goals)
+            or not is_native(draw.source, values, *goals)
+        ):
+            return None
+        return relabel_rows(desired, values, columns, future, draw.source)
+
+    def _relabel_leaves(
+        self, td: TensorDictBase, draw: HindsightDraw
+    ) -> tuple[Goals, torch.Tensor, torch.Tensor]:
+        """Returns goals, achieved goals and which are new."""
+        relabeled = (draw.source >= td.shape[0]).unsqueeze(-1)
         achieved = self.read_goals(td)
         goals: Goals = {}
         for key, reached in achieved.items():
@@ -330,17 +377,7 @@ class HindsightGoal(FutureGoal):
             if draw.future is not None:
                 parts.append(draw.future[key].to(desired))
             goals[key] = torch.cat(parts).index_select(0, draw.source)
-        is_new = relabeled if flags is None else relabeled | flags
-        leaves = self._goal_leaves(
-            td, _vector(achieved), _vector(goals), where=is_new.reshape(-1)
-        )
-        after = {self.layout.next(key): goal for key, goal in goals.items()}
-        return {
-            **goals,
-            **{k: goal for k, goal in after.items() if leaf_of(td, k) is not None},
-            **leaves,
-            self.keys.relabeled: relabeled,
-        }
+        return goals, _vector(achieved), relabeled
 
     def apply_parameters(
         self, tensordict: TensorDictBase, draw: HindsightDraw

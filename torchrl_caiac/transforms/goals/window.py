@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._batches import with_leaves
 from torchrl_caiac._keys import path
-from torchrl_caiac._torchrl import with_leaves
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_window

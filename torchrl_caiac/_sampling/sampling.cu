@@ -1,7 +1,7 @@
-// What sampling does to each row, on a CUDA device: the functions of _sampling.c.
+// What sampling does to each row, on a CUDA device: the functions of sampling.c.
 //
 // Each kernel gives the numbers of its reference in Python, to the bit; see
-// _sampling.py. All tensors are contiguous and on one device. A kernel has one argument,
+// its Python modules. All tensors are contiguous and on one device. A kernel has one argument,
 // a struct of 8-byte fields. Rows that are out of range stop the device, as an index of
 // torch does. Every kernel is right for any number of threads and blocks.
 
@@ -10,6 +10,7 @@ typedef unsigned long long u64;
 typedef unsigned char u8;
 
 #define LEAVES 16     // tensors that one launch reads
+#define NEXT 0x9E3779B97F4A7C15ull // of _fingerprints
 #define THREADS 1024  // of a block, at most
 
 #define EACH(i, count) \
@@ -66,6 +67,66 @@ extern "C" __global__ void state_matches(const StateMatches a)
                 left -= (u64)(i64)value[c] * (u64)a.weights[l][c];
         }
         a.valid[r] = ((i64)left >> 32) == a.upper;
+    }
+}
+
+// BatchCheck, for batches without anything unusual: which rows have the scores of their
+// states, and are followed by the next row of their window.
+struct RowsFit {
+    i64 rows, window;
+    const i64 *known;
+    i64 upper;
+    const i64 *ids;
+    i64 leaves, flags;
+    u8 *valid;
+    const int *states[LEAVES], *next[LEAVES];
+    const i64 *weights[LEAVES];
+    i64 widths[LEAVES];
+    const u8 *flag[LEAVES];
+};
+
+extern "C" __global__ void rows_fit(const RowsFit a)
+{
+    EACH(r, a.rows) {
+        bool is_last = (r + 1) % a.window == 0, fits = true;
+        u64 state = 0, after = 0;
+        for (i64 l = 0; l < a.leaves; l++) {
+            const int *here = a.states[l] + r * a.widths[l];
+            const int *there = a.next[l] + r * a.widths[l];
+            for (i64 c = 0; c < a.widths[l]; c++) {
+                state += (u64)(i64)here[c] * (u64)a.weights[l][c];
+                after += (u64)(i64)there[c] * (u64)a.weights[l][c];
+                fits &= is_last || there[c] == here[c + a.widths[l]];
+            }
+        }
+        if (a.known)
+            fits &= ((i64)((u64)a.known[r] - state - NEXT * after) >> 32) == a.upper;
+        if (!is_last) {
+            fits &= !a.ids || a.ids[r] == a.ids[r + 1];
+            for (i64 f = 0; f < a.flags; f++)
+                fits &= !a.flag[f][r];
+        }
+        a.valid[r] = fits;
+    }
+}
+
+// draws.uninfluenced: whether the scores of a window are at most the limits, of which
+// there is one for all entities or one for each.
+struct Uninfluenced {
+    i64 windows, window, entities;
+    const float *scores, *limits;
+    i64 step;
+    u8 *is_free;
+};
+
+extern "C" __global__ void uninfluenced(const Uninfluenced a)
+{
+    EACH(i, a.windows * a.entities) {
+        i64 n = i % a.entities, first = i / a.entities * a.window;
+        bool found = true;
+        for (i64 w = 0; w < a.window; w++)
+            found &= a.scores[(first + w) * a.entities + n] <= a.limits[n * a.step];
+        a.is_free[i] = found;
     }
 }
 
@@ -245,6 +306,37 @@ extern "C" __global__ void read_columns(const ReadColumns a)
             __trap();
         copy(a.out + i * a.size,
              a.source + (place * a.width + a.columns[i % a.read]) * a.size, a.size);
+    }
+}
+
+// HindsightGoal: the goals of rows by their sources, and the goals that rows achieve.
+struct RelabelRows {
+    i64 rows, width, size; // columns of a goal, bytes of a value
+    const i64 *source;
+    const char *desired, *future, *values;
+    i64 columns; // of values
+    const i64 *column;
+    char *goals, *achieved;
+    u8 *relabeled;
+};
+
+extern "C" __global__ void relabel_rows(const RelabelRows a)
+{
+    EACH(i, a.rows * a.width) {
+        i64 r = i / a.width, c = i % a.width, from = a.source[r];
+        const char *column = a.values + a.column[c] * a.size;
+        i64 step = a.columns * a.size;
+        if (from < 0 || from >= (a.future ? 3 : 2) * a.rows)
+            __trap();
+        copy(a.achieved + i * a.size, column + r * step, a.size);
+        const char *goal = a.desired + (from * a.width + c) * a.size;
+        if (from >= 2 * a.rows)
+            goal = a.future + ((from - 2 * a.rows) * a.width + c) * a.size;
+        else if (from >= a.rows)
+            goal = column + (from - a.rows) * step;
+        copy(a.goals + i * a.size, goal, a.size);
+        if (c == 0)
+            a.relabeled[r] = from >= a.rows;
     }
 }
 

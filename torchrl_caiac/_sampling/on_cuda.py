@@ -1,4 +1,4 @@
-"""The kernels of ``_sampling.cu``: compiled once in a process, by NVRTC, and started.
+"""The kernels of ``sampling.cu``: compiled once in a process, by NVRTC, and started.
 
 PyTorch comes with that compiler. Where it does not work, what calls :func:`is_there`
 uses operations of torch.
@@ -10,20 +10,31 @@ import ctypes
 import logging
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from torchrl_caiac._torchrl import compile_cuda
 
-__all__ = ["LEAVES", "address", "blocks", "is_there", "start"]
+__all__ = [
+    "LEAVES",
+    "address",
+    "blocks",
+    "groups",
+    "is_there",
+    "padded",
+    "run",
+    "start",
+]
+
+_T = TypeVar("_T")
 
 _logger = logging.getLogger("torchrl_caiac")
 
-_SOURCE = Path(__file__).with_name("_sampling.cu")
+_SOURCE = Path(__file__).with_name("sampling.cu")
 LEAVES = 16  # tensors that one start reads, as in the source
 THREADS = {"batch_donors": 512, "hindsight_sources": 512}  # of a block, by kernel
 _THREADS = 128
@@ -31,11 +42,14 @@ _MOST_BLOCKS = 1024
 # The fields of each kernel's struct: q an integer or address, d a float64.
 _FIELDS = {
     "state_matches": f"7q{3 * LEAVES}q",
+    "rows_fit": f"8q{5 * LEAVES}q",
+    "uninfluenced": "7q",
     "chosen_windows": "4q",
     "batch_donors": "7qd6q",
     "buffer_donors": "5qd9q",
     "hindsight_sources": "4q3d2q",
     "read_columns": "9q",
+    "relabel_rows": "12q",
     "swap_rows": f"6q{8 * LEAVES}q",
     "look": f"q{5 * LEAVES}q",
 }
@@ -54,7 +68,7 @@ def is_there(device: torch.device) -> bool:
 
     Examples:
         >>> import torch
-        >>> from torchrl_caiac._sampling_cuda import is_there
+        >>> from torchrl_caiac._sampling.on_cuda import is_there
         >>> is_there(torch.device("cpu"))
         False
     """
@@ -69,6 +83,16 @@ def address(tensor: torch.Tensor | None) -> int:
 def blocks(items: int) -> int:
     """Returns a number of blocks for a number of items."""
     return max(1, min(_MOST_BLOCKS, -(-items // _THREADS)))
+
+
+def groups(items: Sequence[_T]) -> Iterator[Sequence[_T]]:
+    """Yields as many items as one start of a kernel reads."""
+    return (items[i : i + LEAVES] for i in range(0, len(items), LEAVES))
+
+
+def padded(numbers: Sequence[int]) -> list[int]:
+    """Returns numbers of leaves, and zeros for those that are not there."""
+    return [*numbers, *[0] * (LEAVES - len(numbers))]
 
 
 def start(

@@ -1,13 +1,15 @@
 /* What sampling does to each row, without one operation of torch after the other.
  *
  * Each function gives the numbers of its reference in Python, to the bit; see
- * _sampling.py. All tensors are contiguous and on the CPU. A function that
+ * its Python modules. All tensors are contiguous and on the CPU. A function that
  * is given rows returns the place of the first one that is out of range, or GOOD.
  */
 #include <stdint.h>
 #include <string.h>
 
 #define GOOD -1
+#define NOT_FINITE -2
+#define NEXT 0x9E3779B97F4A7C15u /* of _fingerprints */
 #define LINE 64 /* bytes of a cache line */
 #define AHEAD 8 /* rows whose donors are fetched before they are needed */
 
@@ -25,6 +27,15 @@ static uint64_t weighted(const int32_t *value, const int64_t *weight, int64_t wi
     for (int64_t c = 0; c < width; c++)
         sum += (uint64_t)(int64_t)value[c] * (uint64_t)weight[c];
     return sum;
+}
+
+/* Whether all float32 numbers are finite: their exponents are not all ones. */
+int32_t all_finite(int64_t count, const int32_t *values)
+{
+    int32_t found = 0;
+    for (int64_t i = 0; i < count; i++)
+        found |= (values[i] & 0x7f800000) == 0x7f800000;
+    return !found;
 }
 
 /* _fingerprints.state_hash: the hash of one leaf of each row. */
@@ -172,6 +183,31 @@ int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
     return GOOD;
 }
 
+/* HindsightGoal: the goals of rows by their sources, of hindsight_sources, and the goals
+ * that the rows achieve, which are some columns of values. */
+int64_t relabel_rows(int64_t rows, int64_t width, int64_t bytes, const int64_t *source,
+                     const char *desired, const char *future, const char *values,
+                     int64_t row_bytes, int64_t runs, const int64_t *run_start,
+                     const int64_t *run_bytes, char *goals, char *achieved,
+                     uint8_t *relabeled)
+{
+    int64_t size = width * bytes;
+    read_columns(rows, rows, 0, row_bytes, runs, run_start, run_bytes, values, achieved);
+    for (int64_t r = 0; r < rows; r++) {
+        int64_t from = source[r];
+        const char *goal = desired + from * size;
+        if (from < 0 || from >= (future ? 3 : 2) * rows)
+            return r;
+        if (from >= 2 * rows)
+            goal = future + (from - 2 * rows) * size;
+        else if (from >= rows)
+            goal = achieved + (from - rows) * size;
+        memcpy(goals + r * size, goal, (size_t)size);
+        relabeled[r] = from >= rows;
+    }
+    return GOOD;
+}
+
 /* Rows of a leaf, in which entities are those of their donors.
  *
  * An entity has runs of bytes in a row: run i is that of entity run_entity[i].
@@ -210,6 +246,22 @@ static int64_t swap_leaf(int64_t first, int64_t drawn, int64_t window, int64_t e
     return GOOD;
 }
 
+/* draws.uninfluenced: whether the scores of a window are at most the limits, of which
+ * there is one for all entities or one for each. */
+int64_t uninfluenced(int64_t windows, int64_t window, int64_t entities,
+                     const float *scores, const float *limits, int64_t step,
+                     uint8_t *is_free)
+{
+    for (int64_t b = 0; b < windows; b++)
+        for (int64_t n = 0; n < entities; n++) {
+            uint8_t found = 1;
+            for (int64_t w = 0; w < window; w++)
+                found &= scores[(b * window + w) * entities + n] <= limits[n * step];
+            is_free[b * entities + n] = found;
+        }
+    return GOOD;
+}
+
 /* swap.apply_swap: the rows of all leaves.
  *
  * A leaf has nine numbers in the table: those of its source, its bytes a row, its runs,
@@ -230,11 +282,93 @@ int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities
     return GOOD;
 }
 
-/* Whether all float32 numbers are finite: their exponents are not all ones. */
-int32_t all_finite(int64_t count, const int32_t *values)
+/* Whether a batch may be swapped: its scores are those of its states, and the rows of
+ * its windows follow each other. BatchCheck, for batches without anything unusual.
+ *
+ * Numbers: rows, window, known, upper, ids, scores, how many scores, leaves, flags; for
+ * each leaf the addresses of states, next states and weights, and their width; and the
+ * address of each flag. Scores without fingerprints have to be finite.
+ */
+int64_t batch_fits(const int64_t *number)
 {
-    int32_t found = 0;
-    for (int64_t i = 0; i < count; i++)
-        found |= (values[i] & 0x7f800000) == 0x7f800000;
-    return !found;
+    int64_t rows = number[0], window = number[1], leaves = number[7], flags = number[8];
+    const int64_t *known = (const int64_t *)number[2], *ids = (const int64_t *)number[4];
+    const int64_t *leaf = number + 9, *flag = leaf + 4 * leaves;
+    if (!known && !all_finite(number[6], (const int32_t *)number[5]))
+        return 0;
+    for (int64_t start = 0; start < rows; start += window) {
+        uint64_t after = 0;
+        for (int64_t r = start + window - 1; r >= start; r--) {
+            int64_t is_last = r == start + window - 1;
+            uint64_t state = 0;
+            for (int64_t l = 0; l < 4 * leaves; l += 4) {
+                const int32_t *here = (const int32_t *)leaf[l];
+                const int32_t *there = (const int32_t *)leaf[l + 1] + r * leaf[l + 3];
+                const int64_t *weights = (const int64_t *)leaf[l + 2];
+                here += r * leaf[l + 3];
+                if (!is_last
+                    && memcmp(there, here + leaf[l + 3],
+                              (size_t)leaf[l + 3] * sizeof(int32_t)))
+                    return 0;
+                if (known && is_last)
+                    after += weighted(there, weights, leaf[l + 3]);
+                if (known)
+                    state += weighted(here, weights, leaf[l + 3]);
+            }
+            if (known
+                && ((int64_t)((uint64_t)known[r] - state - NEXT * after) >> 32)
+                       != number[3])
+                return 0;
+            after = state;
+            if (is_last)
+                continue;
+            if (ids && ids[r] != ids[r + 1])
+                return 0;
+            for (int64_t f = 0; f < flags; f++)
+                if (((const uint8_t *)flag[f])[r])
+                    return 0;
+        }
+    }
+    return 1;
+}
+
+/* A batch with counterfactual windows, from random numbers: batch_donors, swap_rows and
+ * the flags that CounterfactualTransform adds. NOT_FINITE if a state is not.
+ *
+ * Numbers: windows, first window that is drawn for, entities, window; the addresses of
+ * is_free, order (a permutation of the windows, or 0), chance and share; how many
+ * windows are chosen; the addresses of memory (listed, donors, no_donor; chosen,
+ * swapped), of the counts that no_donor is added to, and of the flags; leaves and
+ * states; for each leaf what swap_rows knows; for each state its address and size.
+ */
+int64_t swap_batch(const int64_t *number, float swap_prob)
+{
+    int64_t count = number[0], first = number[1], entities = number[2];
+    int64_t window = number[3], drawn = count - first;
+    const int64_t *order = (const int64_t *)number[5];
+    int64_t *listed = (int64_t *)number[9], *donors = listed + count;
+    int64_t *no_donor = donors + drawn * entities, *total = (int64_t *)number[11];
+    uint8_t *chosen = (uint8_t *)number[10], *swapped = chosen + drawn;
+    uint8_t *chosen_flag = (uint8_t *)number[12], *swapped_flag = (uint8_t *)number[13];
+    int64_t leaves = number[14], states = number[15];
+    const int64_t *leaf = number + 16, *state = leaf + 9 * leaves;
+    for (int64_t c = 0; c < drawn; c++)
+        chosen[c] = !order || order[c] < number[8];
+    batch_donors(count, first, entities, window, (const uint8_t *)number[4], chosen,
+                 (const float *)number[6], swap_prob, (const double *)number[7], listed,
+                 donors, swapped, no_donor);
+    swap_rows(first * window, drawn, window, entities, donors, swapped, leaves, leaf);
+    for (int64_t i = 0; i < states; i++)
+        if (!all_finite(state[2 * i + 1], (const int32_t *)state[2 * i]))
+            return NOT_FINITE;
+    for (int64_t n = 0; n < entities; n++)
+        total[n] += no_donor[n];
+    memset(chosen_flag, 0, (size_t)(first * window));
+    memset(swapped_flag, 0, (size_t)(first * window * entities));
+    for (int64_t c = 0; c < drawn; c++)
+        for (int64_t r = (first + c) * window; r < (first + c + 1) * window; r++) {
+            chosen_flag[r] = chosen[c];
+            memcpy(swapped_flag + r * entities, swapped + c * entities, (size_t)entities);
+        }
+    return GOOD;
 }

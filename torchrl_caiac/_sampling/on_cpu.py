@@ -1,4 +1,4 @@
-"""The functions of ``_sampling.c``, compiled where they run by the C compiler."""
+"""The functions of ``sampling.c``, compiled where they run by the C compiler."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ import torch
 from torchrl_caiac._kernels import cache_folder, machine, processor_slug
 from torchrl_caiac._whole_files import whole_file
 
-__all__ = ["addresses", "call", "call_with_rows", "library"]
+__all__ = ["GOOD", "addresses", "call", "call_with_rows", "library"]
 
 _logger = logging.getLogger("torchrl_caiac")
 
-_SOURCE = Path(__file__).with_name("_sampling.c")
+_SOURCE = Path(__file__).with_name("sampling.c")
 _FLAGS = ("-O3", "-march=native", "-std=c99", "-shared", "-fPIC")
 _SECONDS = 60  # for compiling
-_GOOD = -1  # what functions in C return if no row is out of range
+GOOD = -1  # what functions in C return if no row is out of range
 
 
 def addresses(tensors: Sequence[torch.Tensor]) -> Any:
@@ -59,7 +59,7 @@ def call_with_rows(
         IndexError: a row is out of range.
     """
     place = call(name, *args)
-    if place != _GOOD:
+    if place != GOOD:
         bad = place if rows is None else int(rows.flatten()[place])
         raise IndexError(f"row {bad} is out of range: there are {length} rows")
 
@@ -71,9 +71,13 @@ _ARGUMENTS: dict[str, list[Any]] = {
     "batch_donors": [*[_I] * 4, *[_P] * 3, ctypes.c_float, *[_P] * 5],
     "buffer_donors": [_I, _I, *[_P] * 3, ctypes.c_float, *[_P] * 3, _I, _I, *[_P] * 4],
     "hindsight_sources": [_I, *[_P] * 3, *[ctypes.c_double] * 3, _P, _P],
+    "relabel_rows": [*[_I] * 3, *[_P] * 4, _I, _I, *[_P] * 5],
     "read_columns": [_I, _I, _P, _I, _I, *[_P] * 4],
     "swap_rows": [*[_I] * 4, _P, _P, _I, _P],
     "all_finite": [_I, _P],
+    "uninfluenced": [_I, _I, _I, _P, _P, _I, _P],
+    "batch_fits": [_P],
+    "swap_batch": [_P, ctypes.c_float],
 }
 
 

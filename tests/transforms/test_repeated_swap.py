@@ -1,0 +1,321 @@
+"""Swaps in batches like an earlier one: the same numbers as step by step."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+from typing import Any
+from unittest import mock
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase
+
+from tests.pretend_cuda import nothing_waits
+from torchrl_caiac import CAIACTransform, EntityLayout
+from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
+from torchrl_caiac._sampling import only_torch
+from torchrl_caiac.transforms import TransformKeys
+from torchrl_caiac.transforms.repeated_swap import RepeatedSwap
+
+FLAT = EntityLayout(
+    {"arm": [0], "cup": [1, 2], "box": [4]},  # column 3 is nobody's
+    goal={"cup": [2, 0], "box": [1]},
+    achieved={"cup": [1, 2], "box": [4]},
+    fixed=["arm"],
+)
+NESTED = EntityLayout.from_keys(
+    {"arm": ("s", "arm"), "cup": ("s", "cup"), "box": ("s", "box")}, fixed=["arm"]
+)
+SCORE = ("caiac", "score")
+DEVICES = pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+)
+
+
+def batch(
+    layout: EntityLayout,
+    windows: int,
+    window: int,
+    *,
+    known: bool = True,
+    done: bool = True,
+    ids: bool = True,
+    seed: int = 0,
+) -> TensorDict:
+    """Windows of trajectories, the scores of half of the entities below 0.5."""
+    of = torch.Generator().manual_seed(seed)
+    rows = windows * window
+    states = torch.rand(windows, window + 1, 5, generator=of)
+    td = TensorDict({"action": torch.rand(rows, 2, generator=of)}, [rows])
+    for where, part in ((lambda k: k, states[:, :-1]), (layout.next, states[:, 1:])):
+        flat = part.reshape(rows, 5)
+        if layout is FLAT:
+            td[where("observation")] = flat.clone()
+            td[where("achieved_goal")] = flat[:, [2, 4, 1]]
+        else:
+            td[where(("s", "arm"))] = flat[:, :1].clone()
+            td[where(("s", "cup"))] = flat[:, 1:3].clone()
+            td[where(("s", "box"))] = flat[:, 3:].clone()
+    if layout is FLAT:
+        td["desired_goal"] = torch.rand(rows, 3, generator=of)
+    td["next", "reward"] = torch.rand(rows, 1, generator=of)
+    td[SCORE] = torch.rand(windows, 3, generator=of).repeat_interleave(window, 0)
+    if ids:
+        td["episode"] = torch.arange(windows).repeat_interleave(window)
+    if done:
+        flags = torch.zeros(windows, window, dtype=torch.bool)
+        flags[:, -1] = True
+        td["next", "done"] = flags.view(rows, 1)
+    if known:
+        here = state_hash(td, layout.in_keys)
+        after = state_hash(td, [layout.next(key) for key in layout.in_keys])
+        assert here is not None
+        td[fingerprint_key(SCORE)] = fingerprint(here, after, layout.names, 0)
+    return td
+
+
+def repeated(transform: CAIACTransform, td: TensorDictBase) -> None:
+    """Shows the transform so many batches that the next one is a repeated swap."""
+    for _ in range(2100 // len(td) * transform.window + 25):
+        transform(td)
+
+
+def taken(transform: CAIACTransform, td: TensorDictBase) -> tuple[Any, bool]:
+    """A swapped batch, and whether it was a repeated swap."""
+    results = []
+    call = RepeatedSwap.__call__
+
+    def watched(*args: Any, **kwargs: Any) -> Any:
+        results.append(call(*args, **kwargs))
+        return results[-1]
+
+    with mock.patch.object(RepeatedSwap, "__call__", watched):
+        out = transform(td)
+    return out, bool(results) and results[-1] is not None
+
+
+def assert_same(one: TensorDictBase, other: TensorDictBase) -> None:
+    """The same leaves, to the bit, in the same places."""
+    keys = set(one.keys(True, True))
+    assert keys == set(other.keys(True, True))
+    for key in keys:
+        here, there = one[key].cpu(), other[key].cpu()
+        assert here.dtype == there.dtype and here.shape == there.shape, key
+        # NaN is equal to itself.
+        assert torch.equal(here.nan_to_num(9.0), there.nan_to_num(9.0)), key
+
+
+@DEVICES
+@settings(max_examples=60, deadline=None)
+@given(
+    nested=st.booleans(),
+    window=st.integers(1, 3),
+    windows=st.integers(2, 9),
+    ratio=st.sampled_from([0.3, 0.5, 1.0]),
+    rows=st.sampled_from(["random", "last"]),
+    swap_prob=st.sampled_from([1.0, 0.5]),
+    threshold=st.sampled_from([0.5, {"cup": 0.3, "box": 0.7}, 0.0]),
+    known=st.booleans(),
+    flags=st.sampled_from([(True, True), (True, False), (False, True)]),
+    check=st.booleans(),
+    seed=st.integers(0, 99),
+)
+@pytest.mark.filterwarnings("ignore:entities are free")
+def test_the_same_as_step_by_step(
+    device: str,
+    nested: bool,
+    window: int,
+    windows: int,
+    ratio: float,
+    rows: Any,
+    swap_prob: float,
+    threshold: Any,
+    known: bool,
+    flags: tuple[bool, bool],
+    check: bool,
+    seed: int,
+) -> None:
+    layout = NESTED if nested else FLAT
+    done, ids = flags
+
+    def made(number: int) -> TensorDict:
+        td = batch(
+            layout, windows, window, known=known, done=done, ids=ids, seed=number
+        )
+        return td.to(device)
+
+    transform = CAIACTransform(
+        layout,
+        threshold,
+        ratio,
+        rows=rows,
+        swap_prob=swap_prob,
+        window=window,
+        check=check,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    fresh = copy.deepcopy(transform)
+    repeated(transform, made(0))
+    transform.generator.set_state(fresh.generator.get_state())
+    transform.reset_no_donor_count()
+    td = made(seed + 1)
+    before = td.clone()
+    out, is_repeated = taken(transform, td)
+    assert is_repeated == (round(ratio * windows) > 0)
+    with only_torch():
+        wanted, is_repeated = taken(fresh, td)
+    assert not is_repeated
+    assert_same(out, wanted)
+    assert_same(td, before)
+    assert torch.equal(transform.no_donor_count.cpu(), fresh.no_donor_count.cpu())
+    assert torch.equal(transform.generator.get_state(), fresh.generator.get_state())
+
+
+def test_settings_that_change() -> None:
+    td = batch(FLAT, 100, 1)
+    transform = CAIACTransform(FLAT, 0.5, rows="last")
+    repeated(transform, td)
+    assert taken(transform, td)[1]
+    transform.counterfactual_ratio = 0.25
+    out, is_repeated = taken(transform, td)
+    assert is_repeated and int(out["caiac", "counterfactual"].sum()) == 25
+    transform.swap_prob = 0.0
+    assert not taken(transform, td)[0]["caiac", "swapped"].any()
+    transform.keys = TransformKeys(swapped="other")
+    out, is_repeated = taken(transform, td)
+    assert not is_repeated and out["other"].shape == (100, 3)
+    assert taken(transform, td)[1]
+    transform.counterfactual_ratio = 0.0
+    out, is_repeated = taken(transform, td)
+    assert not is_repeated and not out["caiac", "counterfactual"].any()
+
+
+@pytest.mark.parametrize(
+    "send", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
+def test_copies_swap_too(send: Any) -> None:
+    td = batch(FLAT, 100, 1)
+    transform = CAIACTransform(FLAT, 0.5)
+    repeated(transform, td)
+    out, is_repeated = taken(send(transform), td)
+    assert is_repeated and out["caiac", "swapped"].any()
+
+
+def changed(td: TensorDict, change: str) -> TensorDict:
+    """A batch of another structure or with something unusual."""
+    td = td.clone()
+    if change == "entry":
+        td["more"] = td["action"]
+    elif change == "dtype":
+        td["observation"] = td["observation"].double()
+        td["next", "observation"] = td["next", "observation"].double()
+        del td[fingerprint_key(SCORE)]
+    elif change == "size":
+        td = td[:-2]
+    elif change == "strided":
+        td["observation"] = torch.stack([td["observation"]] * 2, -1)[..., 0]
+    elif change == "lazy":
+        td = TensorDict.lazy_stack(list(td.unbind(0)))
+    elif change == "shape":
+        td = td.view(2, -1)
+    return td
+
+
+@pytest.mark.parametrize(
+    "change", ["entry", "dtype", "size", "strided", "lazy", "shape"]
+)
+def test_other_batches_are_swapped_step_by_step(change: str) -> None:
+    td = batch(FLAT, 100, 2)
+    generator = torch.Generator()
+    transform = CAIACTransform(FLAT, 0.5, window=2, generator=generator)
+    fresh = copy.deepcopy(transform)
+    repeated(transform, td)
+    other = changed(td, change)
+    generator.set_state(fresh.generator.get_state())
+    out, is_repeated = taken(transform, other)
+    assert not is_repeated
+    assert_same(out, fresh(other))
+    assert taken(transform, td)[1] or taken(transform, td)[1]  # the usual ones again
+
+
+@pytest.mark.parametrize("window", [1, 2])
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("state", "of other states"),
+        ("finite", "is not finite"),
+        ("score", "NaN"),
+        ("ids", "crosses a trajectory's end"),
+        ("done", "crosses a trajectory's end"),
+        ("gap", "do not follow each other"),
+    ],
+)
+def test_faults_raise_the_errors_of_single_steps(
+    window: int, known: bool, fault: str, message: str
+) -> None:
+    if window == 1 and fault in ("ids", "done", "gap"):
+        return  # there is nothing of the kind
+    td = batch(FLAT, 100, window, known=known)
+    transform = CAIACTransform(FLAT, 2.0, 1.0, window=window)
+    repeated(transform, td)
+    row = 8 * window
+    if fault == "state":
+        td["observation"][row, 3] += 0.5
+        if not known:
+            return  # nothing tells
+    elif fault == "finite":
+        td["observation"][row, 3] = math.inf  # is never swapped
+        if known:  # the state of the scores
+            here = state_hash(td, FLAT.in_keys)
+            after = state_hash(td, [FLAT.next(key) for key in FLAT.in_keys])
+            assert here is not None
+            td[fingerprint_key(SCORE)] = fingerprint(here, after, FLAT.names, 0)
+    elif fault == "score":
+        td[SCORE][row, 1] = math.nan
+        if known:
+            return  # score_buffer has checked them
+    elif fault == "ids":
+        td["episode"][row] += 1
+    elif fault == "done":
+        td["next", "done"][row] = True
+    else:
+        td["next", "observation"][row] += 0.5
+    with pytest.raises(ValueError, match=message):
+        transform(td)
+
+
+@pytest.mark.gpu
+def test_a_gpu_is_not_waited_for_and_tells_faults_late() -> None:
+    td = batch(FLAT, 100, 2)
+    transform = CAIACTransform(FLAT, 0.5, window=2)
+    on_gpu = td.to("cuda")
+    repeated(transform, on_gpu)
+    torch.cuda.synchronize()
+    repeated(transform, on_gpu)
+    with nothing_waits():
+        assert taken(transform, on_gpu)[1]
+    bad = td.clone()
+    bad["next", "observation"][4] += 0.5
+    transform(bad.to("cuda"))
+    torch.cuda.synchronize()
+    with pytest.raises(ValueError, match="in an earlier batch did not follow"):
+        transform(on_gpu)
+
+
+@pytest.mark.gpu
+def test_noisy_recordings_on_a_gpu_are_compared_by_distance() -> None:
+    td = batch(FLAT, 200, 2, known=False)
+    transform = CAIACTransform(FLAT, 0.5, window=2)
+    repeated(transform, td.to("cuda"))
+    td["next", "observation"] += 1e-3 * torch.randn(400, 5)
+    on_gpu = td.to("cuda")
+    for _ in range(4):
+        transform(on_gpu)
+        torch.cuda.synchronize()
+    out, is_repeated = taken(transform, on_gpu)
+    assert not is_repeated and bool(out["caiac", "swapped"].any())

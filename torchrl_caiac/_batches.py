@@ -1,0 +1,187 @@
+"""Reading and copying batches quickly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import (
+    MemoryMappedTensor,
+    TensorDict,
+    TensorDictBase,
+    is_tensor_collection,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_caiac._torchrl import entries_of, names_of, tensordict_of
+
+__all__ = ["KnownBatch", "rows_of", "with_leaves"]
+
+
+def with_leaves(
+    td: TensorDictBase, leaves: Mapping[NestedKey, Tensor]
+) -> TensorDictBase:
+    """Returns a shallow copy of a tensordict with other leaves.
+
+    The same as ``copy`` and ``set``, in a third of the time.
+
+    Args:
+        td (TensorDictBase): the tensordict, ``[*B]``; it is not changed.
+        leaves (mapping of NestedKey to torch.Tensor): the leaves, ``[*B, ...]``.
+
+    Returns:
+        TensorDictBase: the copy.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._batches import with_leaves
+        >>> td = TensorDict({"a": torch.zeros(2), "b": {"c": torch.zeros(2)}}, [2])
+        >>> with_leaves(td, {("b", "c"): torch.ones(2)})["b", "c"]
+        tensor([1., 1.])
+    """
+    out = _shallow(td)
+    shape, device = td.batch_size, td.device
+    for key, leaf in leaves.items():
+        *parents, name = (key,) if isinstance(key, str) else key
+        node, entries = out, entries_of(out)
+        for parent in parents:
+            node = None if entries is None else entries.get(parent)
+            entries = entries_of(node)
+        if (
+            entries is not None
+            and leaf.shape[: len(shape)] == shape == node.batch_size
+            and (device is None or leaf.device == device)
+        ):
+            entries[name] = leaf
+        else:
+            out.set(key, leaf)
+    return out
+
+
+class KnownBatch:
+    """The structure of a batch, from which batches like it are read and copied quickly.
+
+    Args:
+        td (TensorDict): the batch ``[B]``.
+        keys (sequence of NestedKey): the leaves to read, which are there.
+
+    Raises:
+        TypeError: a nested entry is not a plain :class:`~tensordict.TensorDict`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac._batches import KnownBatch
+        >>> td = TensorDict({"a": torch.zeros(2), "b": {"c": torch.ones(2)}}, [2])
+        >>> known = KnownBatch(td, [("b", "c")])
+        >>> known.leaves(td)
+        [tensor([1., 1.])]
+        >>> known.leaves(TensorDict({"a": torch.zeros(2)}, [2])) is None
+        True
+        >>> known.copy(td, {("d", "e"): torch.zeros(2)})["d", "e"]
+        tensor([0., 0.])
+    """
+
+    def __init__(self, td: TensorDictBase, keys: Sequence[NestedKey]) -> None:
+        self._nodes: dict[tuple[str, ...], tuple[str, ...]] = {}
+        self._shape, self._device = td.batch_size, td.device
+        self._walk(td, ())
+        self._keys = [((key,) if isinstance(key, str) else tuple(key)) for key in keys]
+        self._kinds = [_kind(td.get(key)) for key in keys]
+
+    def _walk(self, td: Any, path: tuple[str, ...]) -> None:
+        entries = entries_of(td)
+        if entries is None or names_of(td) is not None:
+            raise TypeError(f"{path} is a {type(td).__name__}")
+        if td.batch_size != self._shape:
+            raise TypeError(f"{path} has batch size {list(td.batch_size)}")
+        self._nodes[path] = tuple(entries)
+        for name, entry in entries.items():
+            if not isinstance(entry, Tensor) and is_tensor_collection(entry):
+                self._walk(entry, (*path, name))
+
+    def leaves(self, td: Any) -> list[Tensor] | None:
+        """Returns the leaves of a batch, ``None`` if it has another structure.
+
+        That is another batch size or device, other entries, or one of the leaves has
+        another shape, dtype, device or class.
+
+        Args:
+            td (TensorDictBase): the batch.
+
+        Returns:
+            list of torch.Tensor, optional: the leaves, in the order of the keys.
+        """
+        nodes: dict[tuple[str, ...], dict[str, Any]] = {}
+        for path, names in self._nodes.items():
+            node = nodes[path[:-1]][path[-1]] if path else td
+            entries = entries_of(node)
+            if (
+                entries is None
+                or tuple(entries) != names
+                or node.batch_size != self._shape
+            ):
+                return None
+            nodes[path] = entries
+        if td.device != self._device:
+            return None
+        found = [nodes[key[:-1]][key[-1]] for key in self._keys]
+        return found if list(map(_kind, found)) == self._kinds else None
+
+    def copy(self, td: Any, leaves: Mapping[NestedKey, Tensor]) -> TensorDict:
+        """Returns a shallow copy of a batch of this structure with other leaves.
+
+        Args:
+            td (TensorDict): the batch, for which :meth:`leaves` returned its leaves.
+            leaves (mapping of NestedKey to torch.Tensor): the leaves, ``[B, ...]``, on
+                the device of the batch.
+
+        Returns:
+            TensorDict: the copy.
+        """
+        nodes: dict[tuple[str, ...], dict[str, Any]] = {}
+        for path in self._nodes:
+            node = nodes[path[:-1]][path[-1]] if path else td
+            nodes[path] = dict(entries_of(node) or {})
+        for key, leaf in leaves.items():
+            path = (key,) if isinstance(key, str) else tuple(key)
+            for end in range(len(path)):
+                nodes.setdefault(path[:end], {})
+            nodes[path[:-1]][path[-1]] = leaf
+        out = nodes.pop(())
+        for path in sorted(nodes, key=len, reverse=True):
+            made = tensordict_of(nodes[path], self._shape, self._device)
+            (nodes[path[:-1]] if len(path) > 1 else out)[path[-1]] = made
+        return tensordict_of(out, self._shape, self._device)
+
+
+def _kind(leaf: Tensor) -> tuple[Any, ...]:
+    return type(leaf), leaf.shape, leaf.dtype, leaf.device
+
+
+def _shallow(td: Any) -> Any:
+    entries = entries_of(td)
+    if entries is None:
+        return td.copy()
+    copied = {
+        name: entry
+        if isinstance(entry, Tensor) or not is_tensor_collection(entry)
+        else _shallow(entry)
+        for name, entry in entries.items()
+    }
+    return tensordict_of(copied, td.batch_size, td.device, names_of(td))
+
+
+def rows_of(td: Any, rows: Tensor) -> Any:
+    """Returns ``td[rows]``, int64 ``[B]``, not negative, in half of the time."""
+    if type(td) in (Tensor, MemoryMappedTensor):
+        return td.as_subclass(Tensor).index_select(0, rows)
+    entries = entries_of(td)
+    if entries is None:
+        return td[rows]
+    picked = {name: rows_of(entry, rows) for name, entry in entries.items()}
+    size = torch.Size([len(rows), *td.batch_size[1:]])
+    return tensordict_of(picked, size, td.device, names_of(td))

@@ -1,0 +1,51 @@
+"""What sampling does to each row, in C or CUDA: compiled where it runs.
+
+Each function gives the numbers of its reference, which computes them by operations of
+torch, to the bit. Without a compiler the reference is used. The functions are in
+``sampling.c``, for tensors on the CPU, and in ``sampling.cu``.
+"""
+
+from torchrl_caiac._sampling.draws import (
+    batch_donors,
+    buffer_donors,
+    chosen_windows,
+    hindsight_sources,
+)
+from torchrl_caiac._sampling.native import is_native, only_torch, plain
+from torchrl_caiac._sampling.on_cuda import LEAVES as MOST_LEAVES
+from torchrl_caiac._sampling.rows import (
+    all_finite,
+    batch_fits,
+    free_windows,
+    look,
+    read_columns,
+    relabel_rows,
+    row_sums,
+    rows_fit,
+    state_matches,
+)
+from torchrl_caiac._sampling.runs import Runs
+from torchrl_caiac._sampling.swaps import swap_batch, swap_rows
+
+__all__ = [
+    "MOST_LEAVES",
+    "Runs",
+    "all_finite",
+    "batch_donors",
+    "batch_fits",
+    "buffer_donors",
+    "chosen_windows",
+    "free_windows",
+    "hindsight_sources",
+    "is_native",
+    "look",
+    "only_torch",
+    "plain",
+    "read_columns",
+    "relabel_rows",
+    "row_sums",
+    "rows_fit",
+    "state_matches",
+    "swap_batch",
+    "swap_rows",
+]
