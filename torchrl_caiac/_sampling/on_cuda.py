@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from torchrl_caiac._torchrl import compile_cuda
+from torchrl_caiac._torchrl import compile_cuda, cuda_stream
 
 __all__ = [
     "LEAVES",
@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
+_Pointer = ctypes.c_void_p * 1
 
 _logger = logging.getLogger("torchrl_caiac")
 
@@ -54,6 +55,7 @@ _FIELDS = {
     "look": f"q{5 * LEAVES}q",
 }
 _STRUCTS = {name: struct.Struct("=" + fields) for name, fields in _FIELDS.items()}
+_BYTES = {name: ctypes.c_char * kind.size for name, kind in _STRUCTS.items()}
 
 
 def is_there(device: torch.device) -> bool:
@@ -112,24 +114,26 @@ def start(
     Raises:
         RuntimeError: the driver refuses.
     """
-    argument = ctypes.create_string_buffer(_STRUCTS[name].pack(*fields))
-    run(name, device, grid, argument)
+    packed = _STRUCTS[name].pack(*fields)
+    run(name, device, grid, _BYTES[name].from_buffer_copy(packed))
 
 
 def run(name: str, device: torch.device, grid: tuple[int, int], argument: Any) -> None:
     """Starts a kernel with its struct."""
-    kernels = _kernels(device.index)
-    assert kernels is not None  # is_there() is true
-    with torch.cuda.device(device):
-        error = _driver().cuLaunchKernel(
-            kernels[name],
-            *(*grid, 1),
-            *(THREADS.get(name, _THREADS), 1, 1),
-            0,
-            torch.cuda.current_stream(device).cuda_stream,
-            (ctypes.c_void_p * 1)(ctypes.addressof(argument)),
-            None,
-        )
+    kernels, index = _kernels(device.index), device.index
+    assert kernels is not None and index is not None  # is_there() is true
+    if index != torch.cuda.current_device():
+        with torch.cuda.device(index):
+            return run(name, device, grid, argument)
+    error = _driver().cuLaunchKernel(
+        kernels[name],
+        *(*grid, 1),
+        *(THREADS.get(name, _THREADS), 1, 1),
+        0,
+        cuda_stream(index),
+        _Pointer(ctypes.addressof(argument)),
+        None,
+    )
     if error:
         raise RuntimeError(f"the CUDA driver refuses to start {name}: error {error}")
 
