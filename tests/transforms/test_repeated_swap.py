@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from contextlib import nullcontext
 from typing import Any
 from unittest import mock
 
@@ -13,12 +14,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 
 from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
 from torchrl_caiac._sampling import only_torch
-from torchrl_caiac.transforms import TransformKeys
+from torchrl_caiac.transforms import TransformKeys, WindowGoal
 from torchrl_caiac.transforms.repeated_swap import RepeatedSwap
 
 FLAT = EntityLayout(
@@ -84,7 +86,7 @@ def repeated(transform: CAIACTransform, td: TensorDictBase) -> None:
         transform(td)
 
 
-def taken(transform: CAIACTransform, td: TensorDictBase) -> tuple[Any, bool]:
+def taken(function: Any, *args: Any) -> tuple[Any, bool]:
     """A swapped batch, and whether it was a repeated swap."""
     results = []
     call = RepeatedSwap.__call__
@@ -94,7 +96,7 @@ def taken(transform: CAIACTransform, td: TensorDictBase) -> tuple[Any, bool]:
         return results[-1]
 
     with mock.patch.object(RepeatedSwap, "__call__", watched):
-        out = transform(td)
+        out = function(*args)
     return out, bool(results) and results[-1] is not None
 
 
@@ -301,10 +303,23 @@ def test_a_gpu_is_not_waited_for_and_tells_faults_late() -> None:
         assert taken(transform, on_gpu)[1]
     bad = td.clone()
     bad["next", "observation"][4] += 0.5
-    transform(bad.to("cuda"))
-    torch.cuda.synchronize()
-    with pytest.raises(ValueError, match="in an earlier batch did not follow"):
-        transform(on_gpu)
+    bad["episode"][5] += 1
+    with pytest.raises(ValueError, match=r"invalid in an earlier batch|end"):
+        for _ in range(4):
+            transform(bad.to("cuda"))
+            torch.cuda.synchronize()
+
+
+def test_what_a_subclass_may_swap() -> None:
+    class Odd(CAIACTransform):
+        def swappable(self, scores: torch.Tensor) -> torch.Tensor:
+            return super().swappable(scores).t().contiguous().t()
+
+    td = batch(FLAT, 100, 1)
+    transform = Odd(FLAT, 0.5)
+    repeated(transform, td)
+    out, is_repeated = taken(transform, td)
+    assert not is_repeated and out["caiac", "swapped"].any()
 
 
 @pytest.mark.gpu
@@ -319,3 +334,48 @@ def test_noisy_recordings_on_a_gpu_are_compared_by_distance() -> None:
         torch.cuda.synchronize()
     out, is_repeated = taken(transform, on_gpu)
     assert not is_repeated and bool(out["caiac", "swapped"].any())
+
+
+@pytest.mark.parametrize("lookahead", ["next", 2, "goal"])
+@pytest.mark.parametrize("window", [1, 2])
+def test_lookahead(lookahead: Any, window: int) -> None:
+    rows = batch(FLAT, 30, 10)
+    rows[SCORE] = torch.rand(300, 3, generator=torch.Generator().manual_seed(3))
+
+    def sampler(transform: CAIACTransform) -> ReplayBuffer:
+        goals = WindowGoal(FLAT, window, generator=torch.Generator().manual_seed(5))
+        rb = ReplayBuffer(
+            storage=LazyTensorStorage(300),
+            sampler=SliceSampler(slice_len=window, traj_key="episode"),
+            sample_unit=goals,
+            batch_size=60,
+        )
+        rb.extend(rows)
+        rb.append_transform(goals)
+        rb.append_transform(transform)
+        return rb
+
+    def made() -> CAIACTransform:
+        return CAIACTransform(
+            FLAT,
+            0.8,
+            window=window,
+            lookahead=lookahead,
+            generator=torch.Generator().manual_seed(1),
+        )
+
+    transform, fresh = made(), made()
+    rb, other = sampler(transform), sampler(fresh)
+    for _ in range(100):
+        rb.sample()
+    seen = []
+    for buffer in (rb, other):
+        torch.manual_seed(7)
+        for part in buffer.transform:
+            part.generator.manual_seed(2)
+        with only_torch() if buffer is other else nullcontext():
+            out, is_repeated = taken(buffer.sample)
+        assert is_repeated == (buffer is rb)
+        seen.append(out)
+    assert_same(*seen)
+    assert seen[0]["caiac", "swapped"].any()

@@ -21,6 +21,7 @@ from torchrl_caiac._sampling.rows import (
     read_columns,
     relabel_rows,
     row_sums,
+    rows_equal,
     rows_fit,
     state_matches,
 )
@@ -44,6 +45,7 @@ __all__ = [
     "read_columns",
     "relabel_rows",
     "row_sums",
+    "rows_equal",
     "rows_fit",
     "state_matches",
     "swap_batch",

@@ -72,6 +72,7 @@ _ARGUMENTS: dict[str, list[Any]] = {
     "buffer_donors": [_I, _I, *[_P] * 3, ctypes.c_float, *[_P] * 3, _I, _I, *[_P] * 4],
     "hindsight_sources": [_I, *[_P] * 3, *[ctypes.c_double] * 3, _P, _P],
     "relabel_rows": [*[_I] * 3, *[_P] * 4, _I, _I, *[_P] * 5],
+    "rows_equal": [_I, _I, _P, _I, _P, _P],
     "read_columns": [_I, _I, _P, _I, _I, *[_P] * 4],
     "swap_rows": [*[_I] * 4, _P, _P, _I, _P],
     "all_finite": [_I, _P],

@@ -9,7 +9,7 @@ from functools import lru_cache
 import torch
 
 from torchrl_caiac._sampling import on_cuda as cuda
-from torchrl_caiac._sampling.on_cpu import addresses, call, call_with_rows
+from torchrl_caiac._sampling.on_cpu import GOOD, addresses, call, call_with_rows
 from torchrl_caiac._sampling.runs import Runs
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "read_columns",
     "relabel_rows",
     "row_sums",
+    "rows_equal",
     "rows_fit",
     "state_matches",
 ]
@@ -97,6 +98,22 @@ def state_matches(
         valid,
     )
     return valid
+
+
+def rows_equal(own: torch.Tensor, source: torch.Tensor, rows: torch.Tensor) -> bool:
+    """Returns whether rows are those of a source to the bit, on the CPU.
+
+    Args:
+        own (torch.Tensor): ``[B, ...]``.
+        source (torch.Tensor): ``[T, ...]``.
+        rows (torch.Tensor): int64 ``[B]``.
+
+    Returns:
+        bool: whether they are.
+    """
+    size = own.nbytes // max(1, len(own))
+    count = len(own)
+    return call("rows_equal", count, len(source), rows, size, own, source) == GOOD
 
 
 def read_columns(

@@ -71,6 +71,19 @@ int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
     return GOOD;
 }
 
+/* Lookahead: the first of some rows that differs from its row of a source. */
+int64_t rows_equal(int64_t rows, int64_t length, const int64_t *places, int64_t bytes,
+                   const char *own, const char *source)
+{
+    for (int64_t r = 0; r < rows; r++) {
+        int64_t place = places[r];
+        if (place < 0 || place >= length
+            || memcmp(own + r * bytes, source + place * bytes, (size_t)bytes))
+            return r;
+    }
+    return GOOD;
+}
+
 /* draws.draw_batch_donors, after its random numbers were drawn. */
 int64_t batch_donors(int64_t count, int64_t first, int64_t entities, int64_t window,
                   const uint8_t *is_free, const uint8_t *chosen, const float *chance,

@@ -91,11 +91,22 @@ class SavedModel(nn.Module):
                 value = own.get(name)
                 if found.get(name) == value:
                     continue
+                where = ""
                 if name == "layout":
-                    found[name] = EntityLayout.from_dict(found[name])
+                    saved = found[name]
+                    where = (
+                        " (its "
+                        + ", ".join(
+                            key
+                            for key in {**value, **saved}
+                            if value.get(key) != saved.get(key)
+                        )
+                        + ")"
+                    )
+                    found[name] = EntityLayout.from_dict(saved)
                     value = self.layout
                 raise ValueError(
-                    f"the saved world model has another {name}, saved:\n"
+                    f"the saved world model has another {name}{where}, saved:\n"
                     f"{found.get(name)}\nthis model:\n{value}\nCreate the model with "
                     f"the saved arguments ({found['class']}.from_config)"
                 )

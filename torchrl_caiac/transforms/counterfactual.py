@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
@@ -19,7 +20,7 @@ from torchrl.data import (
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._keys import as_key
-from torchrl_caiac._torchrl import leaf_of, sampled_rows, sampling_buffer
+from torchrl_caiac._torchrl import leaf_of, sampling_buffer
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import (
@@ -471,7 +472,7 @@ class CounterfactualTransform(RandomTransform, ABC):
         if self._repeated is not None and self._repeated.settings == self._settings:
             done = self._repeated(
                 tensordict,
-                self.swappable,
+                partial(self._swappable_in, tensordict),
                 self.num_counterfactual(shape[:1].numel() // self.window),
                 rows=self.chosen_rows,
                 swap_prob=self.swap_prob,
@@ -493,7 +494,7 @@ class CounterfactualTransform(RandomTransform, ABC):
             checked = self._batch_check.before(tensordict, scores)
             scores = checked.scores
         if self._lookahead is not None:
-            locked, differs = self._locked(tensordict, self._lookahead)
+            locked, differs = self._lookahead.sampled(tensordict)
             scores = hold_entities(scores, locked)
             if differs is not None and checked is not None:
                 checked = checked._replace(differs=differs)
@@ -520,24 +521,23 @@ class CounterfactualTransform(RandomTransform, ABC):
     @property
     def _settings(self) -> SwapSettings | None:
         """The settings of repeated swaps, ``None`` if all are done step by step."""
-        if self._donors or self._goal_leaves or self._lookahead is not None:
+        if self._donors or self._goal_leaves or self.unscored == "keep":
             return None
-        if self.unscored == "keep" or self.draw_in_batch is not draw_batch_donors:
+        if self.draw_in_batch is not draw_batch_donors:
             return None
-        return SwapSettings(self.window, self.score_key, self.keys, self.check)
+        return SwapSettings(
+            self.window,
+            self.score_key,
+            self.keys,
+            self.check,
+            on_gpu=self._lookahead is None,
+        )
 
-    def _locked(
-        self, td: TensorDictBase, lookahead: Lookahead
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Returns what the rows of a batch lock, see :meth:`Lookahead.locked`."""
-        found = sampled_rows()
-        if found is None:
-            raise RuntimeError(
-                f"lookahead={self.lookahead!r} reads the trajectories of the buffer "
-                "that samples, but this batch is not sampled from a buffer: get it by "
-                "rb.sample() of the buffer that the transform is appended to"
-            )
-        return lookahead.locked(*found, td)
+    def _swappable_in(self, td: TensorDictBase, scores: torch.Tensor) -> torch.Tensor:
+        """Returns what may be swapped in each window of a batch, ``[B, N]``."""
+        if self._lookahead is not None:
+            scores = hold_entities(scores, self._lookahead.sampled(td)[0])
+        return self.swappable(scores)
 
     def _check_buffer(self, shape: torch.Size) -> None:
         """Raises if the buffer will relabel counterfactual rows of the batch."""

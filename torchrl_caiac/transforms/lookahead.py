@@ -15,7 +15,14 @@ from torchrl.data import ReplayBuffer, StorageEnsemble, TensorStorage
 from torchrl_caiac._fingerprints import fingerprint_key
 from torchrl_caiac._keys import get_leaf
 from torchrl_caiac._processes import ThreadLock
-from torchrl_caiac._torchrl import storage_revision, storage_rows, writes_paused
+from torchrl_caiac._sampling import is_native, plain, rows_equal
+from torchrl_caiac._torchrl import (
+    leaf_of,
+    sampled_rows,
+    storage_revision,
+    storage_rows,
+    writes_paused,
+)
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.influence.score_record import read_record
@@ -32,7 +39,7 @@ from torchrl_caiac.trajectory_cache import (
 )
 from torchrl_caiac.transforms.checks import LateCheck
 from torchrl_caiac.transforms.goals.window import WindowGoal
-from torchrl_caiac.transforms.indexing import pick_rows, plain_tensor
+from torchrl_caiac.transforms.indexing import pick_rows
 from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = [
@@ -394,6 +401,29 @@ class Lookahead:
                 table[rows] = locked_entities(steps, self.rule, built.competing)
             start = stop
 
+    def sampled(
+        self, batch: TensorDictBase
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Returns what the rows of a batch lock that a buffer is sampling.
+
+        Args:
+            batch (TensorDictBase): the batch, ``[B]``.
+
+        Returns:
+            tuple of torch.Tensor: as of :meth:`locked`.
+
+        Raises:
+            RuntimeError: no buffer is sampling it; and as :meth:`locked`.
+        """
+        found = sampled_rows()
+        if found is None:
+            raise RuntimeError(
+                f"lookahead={self.rule!r} reads the trajectories of the buffer that "
+                "samples, but this batch is not sampled from a buffer: get it by "
+                "rb.sample() of the buffer that the transform is appended to"
+            )
+        return self.locked(*found, batch)
+
     def locked(
         self, source: ReplayBuffer, index: Any, drawn: Any, batch: TensorDictBase
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
@@ -411,8 +441,8 @@ class Lookahead:
 
         Returns:
             tuple of torch.Tensor: bool ``[B, N]``; and on an accelerator, which is not
-            waited for, bool ``[]``, whether the batch consists of other rows, else
-            ``None``.
+            waited for, bool ``[]``, whether the batch consists of other rows, if that
+            is not known.
 
         Raises:
             KeyError: the batch lacks the steps to its goals, with the rule ``"goal"``.
@@ -431,14 +461,12 @@ class Lookahead:
             )
         rows = flat_rows(index, storage)
         own = (self.score_key, fingerprint_key(self.score_key))
-        device = batch.get(self.score_key).device
+        device = leaf_of(batch, self.score_key).device
         late = LateCheck.needed(device)
-        differs = torch.zeros((), dtype=torch.bool, device=device)
         same = len(rows) == len(batch)
-        if same:
-            differs = _differing(batch, drawn, own).any()
-            same = late or not bool(differs)
-        if not same:
+        differing = _differing(batch, drawn, own) if same else None
+        differs = None if differing is None else differing.any()
+        if not same or (differs is not None and not late and bool(differs)):
             raise RuntimeError(
                 "the batch does not have the rows that the buffer drew, so that the "
                 "trajectories of its rows are unknown: append this transform before "
@@ -453,8 +481,10 @@ class Lookahead:
         self._seen.last = weakref.ref(storage), revision
         if last is not None and last[0]() is storage and last[1] == revision:
             # Nothing was written since this thread drew, so that no row was replaced.
-            differs = differs | replaced.any()
-            if not late and bool(differs):
+            if replaced is not None:
+                other = replaced.any()
+                differs = other if differs is None else differs | other
+            if differs is not None and not late and bool(differs):
                 raise RuntimeError(
                     f"{self.score_key!r}, or the trajectory ids, of the batch are not "
                     "those of the storage: append this transform before those that "
@@ -463,7 +493,9 @@ class Lookahead:
         if self.rule == "goal":
             competing = self._competes.to(device)
             found = locked_entities(found, self._goal_steps(source, batch), competing)
-        return found | replaced.unsqueeze(-1), differs if late else None
+        if replaced is not None:
+            found = found | replaced.unsqueeze(-1)
+        return found, differs if late else None
 
     def _goal_steps(self, source: ReplayBuffer, batch: TensorDictBase) -> torch.Tensor:
         """Returns the steps to the goals that the buffer drew for a batch."""
@@ -499,26 +531,35 @@ def _differing(
     data: TensorDictBase,
     keys: tuple[NestedKey, ...],
     rows: torch.Tensor | None = None,
-) -> torch.Tensor:
+) -> torch.Tensor | None:
     """Returns which rows of a batch have other values than rows of the data.
 
     Args:
         batch (TensorDictBase): the batch, ``[B]``.
         data (TensorDictBase): the data.
-        keys (tuple of NestedKey): the leaves, which may be missing, but the first one.
+        keys (tuple of NestedKey): the leaves, which may be missing.
         rows (torch.Tensor, optional): ``[B]``. Defaults to the first ``B``.
 
     Returns:
-        torch.Tensor: bool ``[B]``.
+        torch.Tensor, optional: bool ``[B]``; ``None`` if it is known that none has.
     """
-    device = batch.get(keys[0]).device
-    differ = torch.zeros(len(batch), dtype=torch.bool, device=device)
+    differ: torch.Tensor | None = None
     for key in keys:
-        leaf, found = batch.get(key, None), data.get(key, None)
+        leaf, found = leaf_of(batch, key), leaf_of(data, key)
         if leaf is None or found is None or leaf is found:
             continue
-        found = plain_tensor(found)
-        found = (found if rows is None else pick_rows(found, rows)).to(leaf)
-        other = found.nan_to_num() != leaf.nan_to_num()
-        differ |= other.reshape(len(batch), -1).any(-1)
+        found = plain(found)
+        if rows is not None:
+            if (
+                leaf.device.type == "cpu"
+                and (leaf.dtype, leaf.shape[1:]) == (found.dtype, found.shape[1:])
+                and (rows.dtype, rows.shape) == (torch.int64, leaf.shape[:1])
+                and is_native(leaf, rows, sources=[found])
+                and rows_equal(leaf, found, rows)
+            ):
+                continue
+            found = pick_rows(found, rows)
+        other = found.to(leaf).nan_to_num() != leaf.nan_to_num()
+        other = other.reshape(len(batch), -1).any(-1)
+        differ = other if differ is None else differ | other
     return differ

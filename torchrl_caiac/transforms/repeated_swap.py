@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -39,12 +39,14 @@ class SwapSettings(NamedTuple):
         score_key (NestedKey): the scores.
         keys (TransformKeys): the other keys.
         check (bool): whether to check the values of batches.
+        on_gpu (bool): whether it may be used on a CUDA device.
     """
 
     window: int
     score_key: NestedKey
     keys: TransformKeys
     check: bool
+    on_gpu: bool
 
 
 class RepeatedSwap:
@@ -56,9 +58,8 @@ class RepeatedSwap:
 
     Attributes:
         settings (SwapSettings): those of the transform.
-        is_noisy (bool): whether a batch on a CUDA device has shown that states and next
-            states are separate, noisy recordings, so that all batches are swapped step
-            by step.
+        is_noisy (bool): whether the states of windows on a CUDA device were not all the
+            next states before them, so that all batches are swapped step by step.
 
     Args:
         td (TensorDictBase): the earlier batch, ``[B * window]``, before it was swapped.
@@ -78,7 +79,7 @@ class RepeatedSwap:
         settings: SwapSettings,
     ) -> None:
         self._plan, self.settings = plan, settings
-        window, score_key, keys, check = settings
+        window, score_key, keys, check, _ = settings
         states = layout.in_keys
         after = [layout.next(key) for key in states]
         known = fingerprint_key(score_key)
@@ -91,6 +92,8 @@ class RepeatedSwap:
             "flags": end_flag_keys(td, keys.done) if check and window > 1 else [],
             "scores": [score_key],
         }
+        if not plan.leaves:
+            raise TypeError("all entities are fixed")
         if window > 1 and leaf_of(td, STEPS_KEY) is not None:
             raise TypeError("next states are several steps later")
         if check and window > 1 and not (read["ids"] or read["flags"]):
@@ -156,6 +159,8 @@ class RepeatedSwap:
     def _need(self, leaves: dict[str, list[torch.Tensor]]) -> None:
         """Raises where values are of other types than the functions in C read."""
         rows = len(leaves["scores"][0])
+        if leaves["scores"][0].is_cuda and not self.settings.on_gpu:
+            raise TypeError("the batch is on a CUDA device")
         if max(map(len, leaves.values())) > MOST_LEAVES:
             raise TypeError("there are many leaves")
         for here, there in zip(leaves["state"], leaves["next"], strict=True):
@@ -208,13 +213,13 @@ class RepeatedSwap:
             it has to be swapped step by step, before anything was drawn.
 
         Raises:
-            ValueError: a state is not finite; on a CUDA device one of an earlier batch,
-                or the rows of an earlier batch do not fit.
+            ValueError: a state is not finite; on a CUDA device in an earlier batch, or
+                its scores were those of other states.
         """
         leaves = self._leaves(td)
-        if leaves is None or count == 0 or not is_native(no_donor):
+        if leaves is None or count == 0:
             return None
-        window, _, keys, check = self.settings
+        window, _, keys, check, _ = self.settings
         scores = leaves["scores"][0]
         states = list(zip(leaves["state"], leaves["next"], self._weights, strict=True))
         known, ids = (next(iter(leaves[name]), None) for name in ("known", "ids"))
@@ -229,16 +234,18 @@ class RepeatedSwap:
         elif check and not batch_fits(states, scores, known, *rest):
             return None
         free = swappable(scores)
-        windows, entities = free.shape
+        windows, entities = len(scores) // window, scores.shape[1]
+        if (free.shape, free.dtype) != ((windows, entities), torch.bool):
+            return None
+        if not is_native(free, no_donor):
+            return None
         order, drawn = None, count
         if rows == "random" and count < windows:
-            draw = draw_windows if is_late else window_numbers
-            order = draw(
-                windows,
-                *([count] if is_late else []),
-                device=free.device,
-                generator=generator,
-            )
+            source: dict[str, Any] = {"device": free.device, "generator": generator}
+            if is_late:
+                order = draw_windows(windows, count, **source)
+            else:
+                order = window_numbers(windows, **source)
             drawn = windows
         chance = None
         if swap_prob < 1.0:
@@ -282,32 +289,19 @@ class RepeatedSwap:
         return out
 
     def _were_valid(self, valid: torch.Tensor) -> bool:
-        """Returns whether the rows of all batches that are known of do fit.
+        """Returns whether the rows of all earlier batches that are known of fit.
 
         Args:
             valid (torch.Tensor): bool ``[B * window]``, of the newest batch.
 
         Returns:
-            bool: false from the first batch on that shows that the data are separate,
-            noisy recordings of states and next states, which are compared otherwise.
-
-        Raises:
-            ValueError: an earlier batch does not fit, and the newest one does.
+            bool: false from the first batch on that does not fit. States and next
+            states may be separate recordings, which single steps compare by distance.
         """
-        if self.is_noisy:
-            return False
-        if self._late.found():
-            if bool(valid.all()):
-                raise ValueError(
-                    "the rows of windows in an earlier batch did not follow each "
-                    "other, or had scores of other states. On a CUDA device errors are "
-                    "late; "
-                    "sample the same data on the CPU to find the rows"
-                )
-            self.is_noisy = True
-            return False
-        self._late.look([LateValue(valid, "false")])
-        return True
+        self.is_noisy = self.is_noisy or bool(self._late.found())
+        if not self.is_noisy:
+            self._late.look([LateValue(valid, "false")])
+        return not self.is_noisy
 
 
 def _trajectory_ids(td: TensorDictBase, keys: TransformKeys) -> Sequence[NestedKey]:
