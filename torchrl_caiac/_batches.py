@@ -10,6 +10,7 @@ from tensordict import (
     MemoryMappedTensor,
     TensorDict,
     TensorDictBase,
+    is_non_tensor,
     is_tensor_collection,
 )
 from tensordict.utils import NestedKey
@@ -86,7 +87,10 @@ class KnownBatch:
     """
 
     def __init__(self, td: TensorDictBase, keys: Sequence[NestedKey]) -> None:
-        self._nodes: dict[tuple[str, ...], tuple[str, ...]] = {}
+        # The names of the entries of each node, and which of them are tensors.
+        self._nodes: dict[tuple[str, ...], tuple[tuple[str, ...], list[bool]]] = {}
+        # Entries without tensors, such as texts, which copies share.
+        self._others: list[tuple[tuple[str, ...], str, type]] = []
         self._shape, self._device = td.batch_size, td.device
         self._walk(td, ())
         self._keys = [((key,) if isinstance(key, str) else tuple(key)) for key in keys]
@@ -96,11 +100,14 @@ class KnownBatch:
         entries = entries_of(td)
         if entries is None or names_of(td) is not None:
             raise TypeError(f"{path} is a {type(td).__name__}")
-        if td.batch_size != self._shape:
-            raise TypeError(f"{path} has batch size {list(td.batch_size)}")
-        self._nodes[path] = tuple(entries)
+        if (td.batch_size, td.device) != (self._shape, self._device):
+            raise TypeError(f"{path} has another batch size or device")
+        are_tensors = [isinstance(entry, Tensor) for entry in entries.values()]
+        self._nodes[path] = tuple(entries), are_tensors
         for name, entry in entries.items():
-            if not isinstance(entry, Tensor) and is_tensor_collection(entry):
+            if is_non_tensor(entry):
+                self._others.append((path, name, type(entry)))
+            elif not isinstance(entry, Tensor) and is_tensor_collection(entry):
                 self._walk(entry, (*path, name))
 
     def leaves(self, td: Any) -> list[Tensor] | None:
@@ -116,17 +123,22 @@ class KnownBatch:
             list of torch.Tensor, optional: the leaves, in the order of the keys.
         """
         nodes: dict[tuple[str, ...], dict[str, Any]] = {}
-        for path, names in self._nodes.items():
+        for path, (names, are_tensors) in self._nodes.items():
             node = nodes[path[:-1]][path[-1]] if path else td
             entries = entries_of(node)
             if (
                 entries is None
                 or tuple(entries) != names
+                or [isinstance(x, Tensor) for x in entries.values()] != are_tensors
                 or node.batch_size != self._shape
+                or node.device != self._device
+                or names_of(node) is not None
             ):
                 return None
             nodes[path] = entries
-        if td.device != self._device:
+        if any(
+            type(nodes[path][name]) is not kind for path, name, kind in self._others
+        ):
             return None
         found = [nodes[key[:-1]][key[-1]] for key in self._keys]
         return found if list(map(_kind, found)) == self._kinds else None

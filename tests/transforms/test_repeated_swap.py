@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 
 from tests.pretend_cuda import nothing_waits
@@ -207,6 +207,52 @@ def test_copies_swap_too(send: Any) -> None:
     assert is_repeated and out["caiac", "swapped"].any()
 
 
+def test_texts_stay() -> None:
+    td = batch(FLAT, 100, 1)
+    td["task"] = NonTensorStack(*map(str, range(100)), batch_size=[100])
+    td["next", "info"] = NonTensorData("push", batch_size=[100])
+    transform = CAIACTransform(FLAT, 0.5)
+    repeated(transform, td)
+    out, is_repeated = taken(transform, td)
+    assert is_repeated and out["caiac", "swapped"].any()
+    assert out[7]["task"] == "7" and out[7]["next", "info"] == "push"
+
+
+@pytest.mark.parametrize("rows", ["random", "last"])
+@pytest.mark.parametrize("ratio", [1.5, -0.5])
+def test_more_windows_than_there_are(rows: Any, ratio: float) -> None:
+    td = batch(FLAT, 100, 1)
+    transform = CAIACTransform(FLAT, 0.5, rows=rows)
+    fresh = copy.deepcopy(transform)
+    repeated(transform, td)
+    for some in (transform, fresh):
+        some.counterfactual_ratio = ratio
+        with pytest.raises(ValueError, match="counterfactual_ratio to a share"):
+            some(td)
+
+
+def test_another_default_device() -> None:
+    td = batch(FLAT, 100, 1)
+    transform = CAIACTransform(FLAT, 0.5, generator=torch.Generator())
+    fresh = copy.deepcopy(transform)
+    repeated(transform, td)
+    transform.generator.set_state(fresh.generator.get_state())
+    with torch.device("meta"):
+        out, is_repeated = taken(transform, td)
+    assert is_repeated
+    assert_same(out, fresh(td))
+
+
+def test_another_swap_prob_that_is_no_number() -> None:
+    td = batch(FLAT, 100, 1)
+    transform = CAIACTransform(FLAT, 0.5, generator=torch.Generator())
+    fresh = copy.deepcopy(transform)
+    repeated(transform, td)
+    transform.generator.set_state(fresh.generator.get_state())
+    transform.swap_prob = fresh.swap_prob = math.nan
+    assert_same(transform(td), fresh(td))
+
+
 def changed(td: TensorDict, change: str) -> TensorDict:
     """A batch of another structure or with something unusual."""
     td = td.clone()
@@ -224,11 +270,18 @@ def changed(td: TensorDict, change: str) -> TensorDict:
         td = TensorDict.lazy_stack(list(td.unbind(0)))
     elif change == "shape":
         td = td.view(2, -1)
+    elif change == "names":
+        td.names = ["time"]
+    elif change == "device":
+        td["next"] = td["next"].to("cpu")
+    elif change == "kind":
+        td["action"] = TensorDict({"x": td["action"]}, td.batch_size)
     return td
 
 
 @pytest.mark.parametrize(
-    "change", ["entry", "dtype", "size", "strided", "lazy", "shape"]
+    "change",
+    ["entry", "dtype", "size", "strided", "lazy", "shape", "names", "device", "kind"],
 )
 def test_other_batches_are_swapped_step_by_step(change: str) -> None:
     td = batch(FLAT, 100, 2)
@@ -240,7 +293,10 @@ def test_other_batches_are_swapped_step_by_step(change: str) -> None:
     generator.set_state(fresh.generator.get_state())
     out, is_repeated = taken(transform, other)
     assert not is_repeated
-    assert_same(out, fresh(other))
+    wanted = fresh(other)
+    assert_same(out, wanted)
+    assert out.names == wanted.names and out["next"].device == wanted["next"].device
+    assert out["action"] is not other["action"] or change != "kind"
     assert taken(transform, td)[1] or taken(transform, td)[1]  # the usual ones again
 
 
@@ -310,16 +366,20 @@ def test_a_gpu_is_not_waited_for_and_tells_faults_late() -> None:
             torch.cuda.synchronize()
 
 
-def test_what_a_subclass_may_swap() -> None:
+@pytest.mark.parametrize(
+    ("change", "is_fit"),
+    [(lambda x: x.t().contiguous().t(), True), (lambda x: x.byte(), False)],
+)
+def test_what_a_subclass_may_swap(change: Any, is_fit: bool) -> None:
     class Odd(CAIACTransform):
         def swappable(self, scores: torch.Tensor) -> torch.Tensor:
-            return super().swappable(scores).t().contiguous().t()
+            return change(super().swappable(scores))
 
     td = batch(FLAT, 100, 1)
     transform = Odd(FLAT, 0.5)
     repeated(transform, td)
     out, is_repeated = taken(transform, td)
-    assert not is_repeated and out["caiac", "swapped"].any()
+    assert is_repeated == is_fit and out["caiac", "swapped"].any()
 
 
 @pytest.mark.gpu

@@ -48,7 +48,7 @@ def batch_donors(
         ]
         cuda.start("batch_donors", free.device, (entities, 1), fields)
         return found
-    listed = torch.empty(count, dtype=torch.int64)
+    listed = free.new_empty(count, dtype=torch.int64)
     call(
         "batch_donors",
         count,

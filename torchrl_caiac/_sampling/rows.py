@@ -37,7 +37,7 @@ def row_sums(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     Returns:
         torch.Tensor: int64 ``[B]``.
     """
-    sums = torch.empty(len(values), dtype=torch.int64)
+    sums = weights.new_empty(len(values))
     call(
         "row_sums",
         *values.shape,

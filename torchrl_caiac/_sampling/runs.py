@@ -47,6 +47,6 @@ class Runs(NamedTuple):
                 runs[-1][2] += itemsize
             else:
                 runs.append([owner, column * itemsize, itemsize])
-        table = torch.tensor(runs, dtype=torch.int64).reshape(-1, 3)
+        table = torch.tensor(runs, dtype=torch.int64, device="cpu").reshape(-1, 3)
         entity, start, length = table.t().contiguous().unbind()
         return cls(entity, start, length, ())

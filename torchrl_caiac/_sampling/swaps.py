@@ -128,10 +128,10 @@ def swap_batch(
             free, order, chance, share, window, swap_prob, leaves, no_donor
         )
     outs = [torch.empty_like(own) for own, _ in leaves]
-    numbers = torch.empty(windows + (drawn + 1) * entities, dtype=torch.int64)
-    flags = torch.empty(drawn * (entities + 1), dtype=torch.bool)
-    chosen = torch.empty(rows, 1, dtype=torch.bool)
-    swapped = torch.empty(rows, entities, dtype=torch.bool)
+    numbers = free.new_empty(windows + (drawn + 1) * entities, dtype=torch.int64)
+    flags = free.new_empty(drawn * (entities + 1))
+    chosen = free.new_empty(rows, 1)
+    swapped = free.new_empty(rows, entities)
     table = [
         *(windows, windows - drawn, entities, window),
         *map(cuda.address, (free, order, chance, share)),

@@ -404,7 +404,7 @@ def _is_pairs(leaf: torch.Tensor) -> bool:
 @lru_cache(maxsize=16)
 def _true(rows: int) -> torch.Tensor:
     """Returns all true, to compare with, which is faster than ``all``."""
-    return torch.ones(rows, dtype=torch.bool)
+    return torch.ones(rows, dtype=torch.bool, device="cpu")
 
 
 def _check_size(leaf: torch.Tensor, key: NestedKey | None, td: TensorDictBase) -> None:

@@ -209,7 +209,7 @@ class CAIACTransform(CounterfactualTransform):
         ):
             numbers = limit
             if not isinstance(numbers, torch.Tensor):
-                numbers = torch.tensor(limit, dtype=torch.float64)
+                numbers = torch.tensor(limit, dtype=torch.float64, device="cpu")
                 numbers = numbers.to(scores.device, dtype).expand(len(self.layout))
             # No score is at most NaN.
             fixed = self.layout.fixed_mask.to(scores.device)

@@ -23,6 +23,7 @@ __all__ = [
     "check_number",
     "check_relabeled_rows",
     "check_window",
+    "check_windows",
 ]
 
 
@@ -101,6 +102,24 @@ def check_window(window: Any) -> int:
     if window < 1:
         raise ValueError(f"window must be at least 1 row, got {window}")
     return window
+
+
+def check_windows(count: int, windows: int) -> int:
+    """Returns how many windows become counterfactual, or raises a ``ValueError``.
+
+    Args:
+        count (int): how many.
+        windows (int): the windows of a batch.
+
+    Returns:
+        int: how many, from 0 to ``windows``.
+    """
+    if not 0 <= count <= windows:
+        raise ValueError(
+            f"{count} of {windows} windows are to become counterfactual: set "
+            "counterfactual_ratio to a share from 0 to 1"
+        )
+    return count
 
 
 def check_generator(generator: Any) -> torch.Generator | None:

@@ -31,6 +31,7 @@ from torchrl_caiac.transforms.checks import (
     check_number,
     check_relabeled_rows,
     check_window,
+    check_windows,
 )
 from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.draws import SwapDraw, draw_batch_donors, draw_windows
@@ -374,8 +375,8 @@ class CounterfactualTransform(RandomTransform, ABC):
         """Draws by scores in which locked entities are held."""
         generator = self.generator if generator is None else generator
         free = self.swappable(scores)
-        total = free.shape[0]
-        count = self.num_counterfactual(total)
+        total = len(free)
+        count = check_windows(self.num_counterfactual(total), total)
         chosen = None
         if self.chosen_rows == "random" and 0 < count < total:
             chosen = draw_windows(total, count, device=free.device, generator=generator)
@@ -469,8 +470,9 @@ class CounterfactualTransform(RandomTransform, ABC):
         self.warn_if_forked()
         self._check_buffer(tensordict.batch_size)
         shape = tensordict.batch_size
-        if self._repeated is not None and self._repeated.settings == self._settings:
-            done = self._repeated(
+        repeated = self._repeated  # which another thread may replace
+        if repeated is not None and repeated.settings == self._settings:
+            done = repeated(
                 tensordict,
                 partial(self._swappable_in, tensordict),
                 self.num_counterfactual(shape[:1].numel() // self.window),
@@ -525,13 +527,8 @@ class CounterfactualTransform(RandomTransform, ABC):
             return None
         if self.draw_in_batch is not draw_batch_donors:
             return None
-        return SwapSettings(
-            self.window,
-            self.score_key,
-            self.keys,
-            self.check,
-            on_gpu=self._lookahead is None,
-        )
+        on_gpu = self._lookahead is None
+        return SwapSettings(self.window, self.score_key, self.keys, self.check, on_gpu)
 
     def _swappable_in(self, td: TensorDictBase, scores: torch.Tensor) -> torch.Tensor:
         """Returns what may be swapped in each window of a batch, ``[B, N]``."""

@@ -212,7 +212,8 @@ def _limits(threshold: float | torch.Tensor, device: torch.device) -> torch.Tens
 
 @lru_cache(maxsize=64)
 def _number(number: float, device: torch.device) -> torch.Tensor:
-    return torch.tensor(number, dtype=torch.float64).to(device, torch.float32)
+    given = torch.tensor(number, dtype=torch.float64, device="cpu")
+    return given.to(device, torch.float32)
 
 
 def window_numbers(

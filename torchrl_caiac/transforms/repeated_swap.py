@@ -58,8 +58,9 @@ class RepeatedSwap:
 
     Attributes:
         settings (SwapSettings): those of the transform.
-        is_noisy (bool): whether the states of windows on a CUDA device were not all the
-            next states before them, so that all batches are swapped step by step.
+        is_unfit (bool): whether an earlier batch has shown that batches have to be
+            swapped step by step: states of windows on a CUDA device are not the next
+            states before them, or what may be swapped has another form.
 
     Args:
         td (TensorDictBase): the earlier batch, ``[B * window]``, before it was swapped.
@@ -115,7 +116,7 @@ class RepeatedSwap:
         ]
         self._runs = [leaf.runs for leaf in plan.leaves]
         self._upper = upper_half(layout.names)
-        self._late, self.is_noisy = LateCheck(), False
+        self._late, self.is_unfit = LateCheck(), False
 
     @classmethod
     def of(
@@ -139,7 +140,7 @@ class RepeatedSwap:
         Returns:
             RepeatedSwap, optional: ``None`` if such batches are swapped step by step.
         """
-        if settings is None or (before is not None and before.is_noisy):
+        if settings is None or (before is not None and before.is_unfit):
             return before
         try:
             return cls(td, plan, layout, settings)
@@ -210,17 +211,19 @@ class RepeatedSwap:
 
         Returns:
             TensorDictBase, optional: the batch with counterfactual windows; ``None`` if
-            it has to be swapped step by step, before anything was drawn.
+            it has to be swapped step by step; nothing was drawn for it.
 
         Raises:
             ValueError: a state is not finite; on a CUDA device in an earlier batch, or
                 its scores were those of other states.
         """
         leaves = self._leaves(td)
-        if leaves is None or count == 0:
-            return None
         window, _, keys, check, _ = self.settings
+        if leaves is None:
+            return None
         scores = leaves["scores"][0]
+        if not 0 < count <= len(scores) // window:
+            return None
         states = list(zip(leaves["state"], leaves["next"], self._weights, strict=True))
         known, ids = (next(iter(leaves[name]), None) for name in ("known", "ids"))
         rest = self._upper, ids, leaves["flags"], window
@@ -233,11 +236,13 @@ class RepeatedSwap:
                     return None
         elif check and not batch_fits(states, scores, known, *rest):
             return None
-        free = swappable(scores)
         windows, entities = len(scores) // window, scores.shape[1]
-        if (free.shape, free.dtype) != ((windows, entities), torch.bool):
-            return None
-        if not is_native(free, no_donor):
+        free = swappable(scores).contiguous()
+        self.is_unfit = self.is_unfit or not (
+            (free.shape, free.dtype) == ((windows, entities), torch.bool)
+            and is_native(free, no_donor, scores)
+        )
+        if self.is_unfit:
             return None
         order, drawn = None, count
         if rows == "random" and count < windows:
@@ -248,7 +253,7 @@ class RepeatedSwap:
                 order = window_numbers(windows, **source)
             drawn = windows
         chance = None
-        if swap_prob < 1.0:
+        if not swap_prob >= 1.0:
             chance = draw_numbers(
                 torch.rand,
                 (entities, drawn),
@@ -298,10 +303,10 @@ class RepeatedSwap:
             bool: false from the first batch on that does not fit. States and next
             states may be separate recordings, which single steps compare by distance.
         """
-        self.is_noisy = self.is_noisy or bool(self._late.found())
-        if not self.is_noisy:
+        self.is_unfit = self.is_unfit or bool(self._late.found())
+        if not self.is_unfit:
             self._late.look([LateValue(valid, "false")])
-        return not self.is_noisy
+        return not self.is_unfit
 
 
 def _trajectory_ids(td: TensorDictBase, keys: TransformKeys) -> Sequence[NestedKey]:
