@@ -82,8 +82,10 @@ def batch(
 
 def repeated(transform: CAIACTransform, td: TensorDictBase) -> None:
     """Shows the transform so many batches that the next one is a repeated swap."""
-    for _ in range(2100 // len(td) * transform.window + 25):
-        transform(td)
+    many = torch.cat([td] * -(-110 * transform.window // len(td)))
+    for _ in range(24):
+        transform(many)
+    transform(td)
 
 
 def taken(function: Any, *args: Any) -> tuple[Any, bool]:
