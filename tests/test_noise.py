@@ -45,7 +45,8 @@ def test_rest_and_motion_are_told_apart(
     found = resting_noise(transitions(change), EntityLayout({"cup": [0]}))["cup"]
     assert abs(1 - found.rest_share - float(moving.double().mean())) < 0.01
     assert 0.9 * noise < found.noise[0] < 1.1 * noise
-    assert 0.75 * motion < found.moving[0] < 1.25 * motion
+    # Of few moving rows the slowest are not counted: 1.29 at most for 1,001 seeds.
+    assert 0.75 * motion < found.moving[0] < 1.35 * motion
     assert found.floor[0] == pytest.approx(max(found.noise[0], found.moving[0] / 10))
     # Nearly every row is told apart by the tolerance, with what the mask needs.
     wrong = (change.abs() > found.tolerance[0]) != moving
