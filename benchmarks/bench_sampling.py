@@ -362,7 +362,7 @@ def bench_operations(
 
 # Batches in which the share of free entities and stored end flags are looked at.
 FIRST_BATCHES = 21
-MOST_OPERATIONS = {"swap": 105, "lookahead": 120, "goals": 150, "donors": 130}
+MOST_OPERATIONS = {"swap": 20, "lookahead": 70, "goals": 65, "donors": 80}
 
 LABELS = {
     "swap": "swap",
