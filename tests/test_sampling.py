@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from torchrl_caiac._sampling import (
     all_finite,
     chosen_windows,
     is_native,
+    on_cuda,
     only_torch,
     read_columns,
     swap_rows,
@@ -598,3 +600,14 @@ def test_uninfluenced_entities(
         limit = torch.tensor([threshold, math.nan, 0.3]).to(device)
     scores = scores.to(device)
     assert torch.equal(*both(lambda: uninfluenced(scores, limit, window), device))
+
+
+@pytest.mark.skipif(torch.version.cuda is None, reason="PyTorch without CUDA")
+@pytest.mark.parametrize("capability", ["75", "90"])
+def test_kernels_compile_for_a_device(capability: str) -> None:
+    from torch.cuda._utils import _nvrtc_compile
+
+    source = Path(on_cuda.__file__).with_name("sampling.cu").read_text()
+    names = re.findall(r"__global__ void (\w+)", source)
+    binary, _ = _nvrtc_compile(source, names[0], capability)
+    assert len(names) == 11 and all(name.encode() in binary for name in names)
