@@ -602,7 +602,10 @@ def test_uninfluenced_entities(
     assert torch.equal(*both(lambda: uninfluenced(scores, limit, window), device))
 
 
-@pytest.mark.skipif(torch.version.cuda is None, reason="PyTorch without CUDA")
+@pytest.mark.skipif(
+    torch.version.cuda is None,
+    reason="this build of PyTorch has no NVRTC, so that nothing compiles kernels",
+)
 @pytest.mark.parametrize("capability", ["75", "90"])
 def test_kernels_compile_for_a_device(capability: str) -> None:
     from torch.cuda._utils import _nvrtc_compile

@@ -198,6 +198,7 @@ def test_settings_that_change() -> None:
     assert not is_repeated and not out["caiac", "counterfactual"].any()
 
 
+# Buffers send their transforms to other processes pickled; nothing is read from a file.
 @pytest.mark.parametrize(
     "send", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
 )
@@ -233,12 +234,18 @@ def test_more_windows_than_there_are(rows: Any, ratio: float) -> None:
             some(td)
 
 
-def test_another_default_device() -> None:
-    td = batch(FLAT, 100, 1)
-    transform = CAIACTransform(FLAT, 0.5, generator=torch.Generator())
+def pair(td: TensorDict, **kwargs: Any) -> tuple[CAIACTransform, CAIACTransform]:
+    """A transform that repeats swaps, and a fresh one that draws the same numbers."""
+    transform = CAIACTransform(FLAT, 0.5, generator=torch.Generator(), **kwargs)
     fresh = copy.deepcopy(transform)
     repeated(transform, td)
     transform.generator.set_state(fresh.generator.get_state())
+    return transform, fresh
+
+
+def test_another_default_device() -> None:
+    td = batch(FLAT, 100, 1)
+    transform, fresh = pair(td)
     with torch.device("meta"):
         out, is_repeated = taken(transform, td)
     assert is_repeated
@@ -247,10 +254,7 @@ def test_another_default_device() -> None:
 
 def test_another_swap_prob_that_is_no_number() -> None:
     td = batch(FLAT, 100, 1)
-    transform = CAIACTransform(FLAT, 0.5, generator=torch.Generator())
-    fresh = copy.deepcopy(transform)
-    repeated(transform, td)
-    transform.generator.set_state(fresh.generator.get_state())
+    transform, fresh = pair(td)
     transform.swap_prob = fresh.swap_prob = math.nan
     assert_same(transform(td), fresh(td))
 
@@ -287,12 +291,8 @@ def changed(td: TensorDict, change: str) -> TensorDict:
 )
 def test_other_batches_are_swapped_step_by_step(change: str) -> None:
     td = batch(FLAT, 100, 2)
-    generator = torch.Generator()
-    transform = CAIACTransform(FLAT, 0.5, window=2, generator=generator)
-    fresh = copy.deepcopy(transform)
-    repeated(transform, td)
+    transform, fresh = pair(td, window=2)
     other = changed(td, change)
-    generator.set_state(fresh.generator.get_state())
     out, is_repeated = taken(transform, other)
     assert not is_repeated
     wanted = fresh(other)
@@ -382,6 +382,26 @@ def test_what_a_subclass_may_swap(change: Any, is_fit: bool) -> None:
     repeated(transform, td)
     out, is_repeated = taken(transform, td)
     assert is_repeated == is_fit and out["caiac", "swapped"].any()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("fault", "message"), [("gap", "do not follow"), ("state", "of other states")]
+)
+def test_a_single_wrong_batch_on_a_gpu(fault: str, message: str) -> None:
+    td = batch(FLAT, 100, 2)
+    transform = CAIACTransform(FLAT, 0.5, window=2)
+    repeated(transform, td.to("cuda"))
+    bad = td.clone()
+    if fault == "gap":
+        bad["next", "observation"][4] += 0.5
+    else:
+        bad["observation"][4] += 0.5  # the first row of a window
+    out, is_repeated = taken(transform, bad.to("cuda"))
+    assert is_repeated and out.device.type == "cuda"
+    torch.cuda.synchronize()
+    with pytest.raises(ValueError, match=message):
+        transform(td.to("cuda"))
 
 
 @pytest.mark.gpu

@@ -257,7 +257,7 @@ def look(
     Args:
         found (torch.Tensor): float64 ``[V]``, gets NaN where something is bad.
         values (sequence of tuple): the place in ``found``, a tensor, the kind of bad
-            value as in ``_sampling.cu``, and which values count, bool, if not all.
+            value as in ``sampling.cu``, and which values count, bool, if not all.
     """
     for some in cuda.groups(values):
         fields = [found.data_ptr()]

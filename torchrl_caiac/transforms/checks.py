@@ -228,7 +228,7 @@ class LateValue(NamedTuple):
         return values.sum(dtype=torch.float64)
 
 
-# Kinds of bad values, as in _sampling.cu.
+# Kinds of bad values, as in _sampling/sampling.cu.
 _KINDS = {
     ("not finite", torch.float32): 0,
     ("not finite", torch.float64): 1,

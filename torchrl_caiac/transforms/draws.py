@@ -27,6 +27,7 @@ __all__ = [
     "DonorBits",
     "DonorIndex",
     "SwapDraw",
+    "donor_numbers",
     "draw_batch_donors",
     "draw_buffer_donors",
     "draw_windows",
@@ -326,6 +327,41 @@ def _chance(free: torch.Tensor, generator: torch.Generator | None) -> torch.Tens
     )
 
 
+def donor_numbers(
+    entities: int,
+    windows: int,
+    swap_prob: float,
+    *,
+    device: torch.device,
+    generator: torch.Generator | None = None,
+) -> tuple[torch.Tensor | None, torch.Tensor]:
+    """Draws what decides which entities of windows are swapped, and their donors.
+
+    Args:
+        entities (int): the number of entities, ``N``.
+        windows (int): the number of windows, ``C``.
+        swap_prob (float): probability of swapping a free entity.
+
+    Keyword Args:
+        device (torch.device): the device of the results.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        tuple of torch.Tensor: below 1, float32 ``[N, C]``: whether they are swapped,
+        ``None`` if all are; and float64 ``[N, C]``: which donor it is.
+    """
+    shape = entities, windows
+    chance = None
+    if not swap_prob >= 1.0:
+        chance = draw_numbers(
+            torch.rand, shape, device=device, generator=generator, dtype=torch.float32
+        )
+    share = draw_numbers(
+        torch.rand, shape, device=device, generator=generator, dtype=torch.float64
+    )
+    return chance, share
+
+
 def draw_batch_donors(
     free: torch.Tensor,
     num_windows: int,
@@ -367,13 +403,8 @@ def draw_batch_donors(
     count, entities = free.shape
     first = count - num_windows
     if num_windows and _is_native_draw(free, chosen, num_windows):
-        chance = None if swap_prob >= 1.0 else _chance(free[first:].t(), generator)
-        share = draw_numbers(
-            torch.rand,
-            (entities, num_windows),
-            device=free.device,
-            generator=generator,
-            dtype=torch.float64,
+        chance, share = donor_numbers(
+            entities, num_windows, swap_prob, device=free.device, generator=generator
         )
         drawn = batch_donors(
             free, num_windows, window, swap_prob, chosen, chance, share

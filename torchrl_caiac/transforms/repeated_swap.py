@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -11,7 +12,6 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._batches import KnownBatch
 from torchrl_caiac._fingerprints import fingerprint_key, leaf_weights, upper_half
-from torchrl_caiac._random import draw_numbers
 from torchrl_caiac._sampling import (
     MOST_LEAVES,
     batch_fits,
@@ -23,12 +23,18 @@ from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flag_keys
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
-from torchrl_caiac.transforms.checks import LateCheck, LateValue
-from torchrl_caiac.transforms.draws import draw_windows, window_numbers
+from torchrl_caiac.transforms.checks import LateCheck
+from torchrl_caiac.transforms.draws import (
+    donor_numbers,
+    draw_windows,
+    window_numbers,
+)
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.swap import SwapPlan
 
 __all__ = ["RepeatedSwap", "SwapSettings"]
+
+_UNKNOWN = 2  # neither true nor false
 
 
 class SwapSettings(NamedTuple):
@@ -116,7 +122,9 @@ class RepeatedSwap:
         ]
         self._runs = [leaf.runs for leaf in plan.leaves]
         self._upper = upper_half(layout.names)
-        self._late, self.is_unfit = LateCheck(), False
+        self.is_unfit = False
+        # Whether each batch fits, which arrives on the host later, and the batch.
+        self._pending: deque[tuple[torch.Tensor, TensorDictBase]] = deque()
 
     @classmethod
     def of(
@@ -215,7 +223,7 @@ class RepeatedSwap:
 
         Raises:
             ValueError: a state is not finite; on a CUDA device in an earlier batch, or
-                its scores were those of other states.
+                its rows or scores were wrong.
         """
         leaves = self._leaves(td)
         window, _, keys, check, _ = self.settings
@@ -232,7 +240,7 @@ class RepeatedSwap:
         if check and is_late:
             if known is not None or window > 1:
                 valid = rows_fit(states, known, *rest)
-                if window > 1 and not self._were_valid(valid):
+                if window > 1 and not self._were_valid(valid, td, batch_check):
                     return None
         elif check and not batch_fits(states, scores, known, *rest):
             return None
@@ -252,21 +260,8 @@ class RepeatedSwap:
             else:
                 order = window_numbers(windows, **source)
             drawn = windows
-        chance = None
-        if not swap_prob >= 1.0:
-            chance = draw_numbers(
-                torch.rand,
-                (entities, drawn),
-                device=free.device,
-                generator=generator,
-                dtype=torch.float32,
-            )
-        share = draw_numbers(
-            torch.rand,
-            (entities, drawn),
-            device=free.device,
-            generator=generator,
-            dtype=torch.float64,
+        chance, share = donor_numbers(
+            entities, drawn, swap_prob, device=free.device, generator=generator
         )
         new, chosen, swapped, is_finite = swap_batch(
             free,
@@ -293,20 +288,47 @@ class RepeatedSwap:
             batch_check.explain_states(out, self._plan.states)
         return out
 
-    def _were_valid(self, valid: torch.Tensor) -> bool:
+    def _were_valid(
+        self, valid: torch.Tensor, td: TensorDictBase, batch_check: BatchCheck
+    ) -> bool:
         """Returns whether the rows of all earlier batches that are known of fit.
+
+        A batch is kept until that is known, since what does not fit may still be right:
+        states and next states may be separate recordings, which are compared by
+        distance.
 
         Args:
             valid (torch.Tensor): bool ``[B * window]``, of the newest batch.
+            td (TensorDictBase): the newest batch.
+            batch_check (BatchCheck): looks at a batch that does not fit, on the CPU.
 
         Returns:
-            bool: false from the first batch on that does not fit. States and next
-            states may be separate recordings, which single steps compare by distance.
+            bool: false from the first batch on that does not fit, but is right.
+
+        Raises:
+            ValueError: an earlier batch is wrong.
         """
-        self.is_unfit = self.is_unfit or bool(self._late.found())
-        if not self.is_unfit:
-            self._late.look([LateValue(valid, "false")])
-        return not self.is_unfit
+        while self._pending and not self.is_unfit:
+            fits, batch = pending = self._pending.popleft()
+            if int(fits) == _UNKNOWN:
+                self._pending.appendleft(pending)
+                break
+            if not int(fits):
+                batch = batch.to("cpu")
+                batch_check.before(batch, batch.get(self.settings.score_key))
+                self.is_unfit = True
+        if self.is_unfit:
+            self._pending.clear()
+            return False
+        fits = torch.full(
+            (), _UNKNOWN, dtype=torch.uint8, device="cpu", pin_memory=valid.is_cuda
+        )
+        fits.copy_(valid.all().to(torch.uint8), non_blocking=True)
+        self._pending.append((fits, td))
+        return True
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_pending": deque()}
 
 
 def _trajectory_ids(td: TensorDictBase, keys: TransformKeys) -> Sequence[NestedKey]:
