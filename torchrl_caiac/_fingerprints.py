@@ -176,19 +176,42 @@ def _matched(
     numbers = (known,) if rows is None else (known, rows)
     if any(x.dtype is not torch.int64 or x.ndim != 1 for x in numbers):
         return None
-    leaves, weights = [], []
+    hashed = hashed_leaves(td, keys, next_keys, len(known))
+    if hashed is None:
+        return None
+    leaves, weights = (list(part) for part in zip(*hashed, strict=True))
+    if not is_native(numbers[-1], sources=[known, *leaves]):
+        return None
+    return state_matches(leaves, weights, known, upper_half(tuple(names)), rows)
+
+
+def hashed_leaves(
+    td: TensorDictBase,
+    keys: Sequence[NestedKey],
+    next_keys: Sequence[NestedKey],
+    length: int,
+) -> list[tuple[torch.Tensor, torch.Tensor]] | None:
+    """Returns the leaves that are hashed, and their weights, as functions in C read them.
+
+    Args:
+        td (TensorDictBase): the rows, ``[T]``.
+        keys (sequence of NestedKey): the entries of states.
+        next_keys (sequence of NestedKey): the entries of next states.
+        length (int): how many rows are needed.
+
+    Returns:
+        list of tuple, optional: float32 ``[T, L]`` and int64 ``[L]`` each; ``None`` if
+        they are of other kinds, fewer than needed, or more than the functions read.
+    """
+    found = []
     for entries, factor in ((keys, 1), (next_keys, _NEXT)):
         for number, leaf in enumerate(state_leaves(td, entries)):
             leaf = plain(leaf)
-            if not _is_row_of_floats(leaf) or len(leaf) < len(known):
+            if not _is_row_of_floats(leaf) or len(leaf) < length:
                 return None
-            leaves.append(leaf)
-            weights.append(_weights(leaf.shape[1], number, factor, leaf.device))
-    if len(leaves) > MOST_LEAVES or not is_native(
-        numbers[-1], sources=[known, *leaves]
-    ):
-        return None
-    return state_matches(leaves, weights, known, upper_half(tuple(names)), rows)
+            weights = _weights(leaf.shape[1], number, factor, leaf.device)
+            found.append((leaf, weights))
+    return found if 0 < len(found) <= MOST_LEAVES else None
 
 
 def _is_row_of_floats(leaf: torch.Tensor) -> bool:

@@ -14,12 +14,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
+from torchrl.data import (
+    LazyTensorStorage,
+    ReplayBuffer,
+    SliceSampler,
+    TensorStorage,
+)
 
 from tests.pretend_cuda import nothing_waits
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
 from torchrl_caiac._sampling import only_torch
+from torchrl_caiac._torchrl import storage_data
 from torchrl_caiac.transforms import TransformKeys, WindowGoal
 from torchrl_caiac.transforms.repeated_swap import RepeatedSwap
 
@@ -126,6 +132,7 @@ def assert_same(one: TensorDictBase, other: TensorDictBase) -> None:
     known=st.booleans(),
     flags=st.sampled_from([(True, True), (True, False), (False, True)]),
     check=st.booleans(),
+    from_buffer=st.booleans(),
     seed=st.integers(0, 99),
 )
 @pytest.mark.filterwarnings("ignore:entities are free")
@@ -141,6 +148,7 @@ def test_the_same_as_step_by_step(
     known: bool,
     flags: tuple[bool, bool],
     check: bool,
+    from_buffer: bool,
     seed: int,
 ) -> None:
     layout = NESTED if nested else FLAT
@@ -152,6 +160,7 @@ def test_the_same_as_step_by_step(
         )
         return td.to(device)
 
+    donors = batch(layout, windows, window, known=known, seed=seed + 100).to(device)
     transform = CAIACTransform(
         layout,
         threshold,
@@ -159,6 +168,7 @@ def test_the_same_as_step_by_step(
         rows=rows,
         swap_prob=swap_prob,
         window=window,
+        donors=TensorStorage(donors, device=device) if from_buffer else None,
         check=check,
         generator=torch.Generator().manual_seed(seed),
     )
@@ -169,7 +179,8 @@ def test_the_same_as_step_by_step(
     td = made(seed + 1)
     before = td.clone()
     out, is_repeated = taken(transform, td)
-    assert is_repeated == (round(ratio * windows) > 0)
+    is_there = device == "cpu" or not from_buffer
+    assert is_repeated == (is_there and round(ratio * windows) > 0)
     with only_torch():
         wanted, is_repeated = taken(fresh, td)
     assert not is_repeated
@@ -241,6 +252,57 @@ def pair(td: TensorDict, **kwargs: Any) -> tuple[CAIACTransform, CAIACTransform]
     repeated(transform, td)
     transform.generator.set_state(fresh.generator.get_state())
     return transform, fresh
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_donors_that_are_written_to_are_taken_back(row: int) -> None:
+    td, storage = batch(FLAT, 100, 2), TensorStorage(batch(FLAT, 30, 2, seed=1))
+    transform, fresh = pair(td, window=2, donors=storage)
+    fresh(td)  # finds the eligible donors
+    for some in (transform, fresh):  # each has its own storage
+        states = storage_data(some.donors)["observation"].view(30, 2, 5)
+        states[:20, row] += 1.0  # behind the back of the storage
+        some.reset_no_donor_count()
+        some.generator.manual_seed(1)
+    out, is_repeated = taken(transform, td)
+    assert is_repeated
+    assert_same(out, fresh(td))
+    lost = transform.no_donor_count
+    assert torch.equal(lost, fresh.no_donor_count) and int(lost.sum()) > 10
+    # They are no longer eligible.
+    out, is_repeated = taken(transform, td)
+    assert is_repeated and torch.equal(transform.no_donor_count, lost)
+    assert out["caiac", "swapped"].any()
+
+
+@pytest.mark.parametrize("case", ["bits", "ring", "goals", "double"])
+def test_donors_that_are_read_step_by_step(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    td, data, more = batch(FLAT, 100, 2), batch(FLAT, 30, 2, seed=1), {}
+    storage = LazyTensorStorage(60)
+    storage.set(range(60), data)
+    if case == "bits":
+        monkeypatch.setattr("torchrl_caiac.transforms.donors._MOST_LISTED", 0)
+    elif case == "ring":
+        storage = LazyTensorStorage(60)
+        rb = ReplayBuffer(storage=storage)
+        rb.extend(torch.cat([data, data])[:62])
+    elif case == "goals":
+        more = {"goals": WindowGoal(FLAT, window=2)}
+    else:
+        for key in ("observation", "desired_goal"):
+            td[key] = td[key].double()
+        td["next", "observation"] = td["next", "observation"].double()
+        del td[fingerprint_key(SCORE)]
+        transform = CAIACTransform(FLAT, 0.5, window=2, donors=storage)
+        with pytest.raises(ValueError, match="donors need the same layout"):
+            transform(td)
+        return
+    transform, fresh = pair(td, window=2, donors=storage, **more)
+    out, is_repeated = taken(transform, td)
+    assert not is_repeated and out["caiac", "swapped"].any()
+    assert_same(out, fresh(td))
 
 
 def test_another_default_device() -> None:

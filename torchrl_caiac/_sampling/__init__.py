@@ -26,11 +26,13 @@ from torchrl_caiac._sampling.rows import (
     state_matches,
 )
 from torchrl_caiac._sampling.runs import Runs
-from torchrl_caiac._sampling.swaps import swap_batch, swap_rows
+from torchrl_caiac._sampling.swaps import DonorRows, SwappedBatch, swap_batch, swap_rows
 
 __all__ = [
     "MOST_LEAVES",
+    "DonorRows",
     "Runs",
+    "SwappedBatch",
     "all_finite",
     "batch_donors",
     "batch_fits",

@@ -12,12 +12,28 @@
 #define NEXT 0x9E3779B97F4A7C15u /* of _fingerprints */
 #define LINE 64 /* bytes of a cache line */
 #define AHEAD 8 /* rows whose donors are fetched before they are needed */
+#define LISTED 512 /* windows whose swaps are listed at a time */
 
 /* Fetches memory that is needed soon. */
 static void fetch(const char *from, int64_t bytes)
 {
     for (int64_t i = 0; i < bytes; i += LINE)
         __builtin_prefetch(from + i);
+}
+
+/* Copies bytes; a few of them without the call of a function. */
+static inline void copy(char *to, const char *from, int64_t bytes)
+{
+    if (bytes > 256) {
+        memcpy(to, from, (size_t)bytes);
+        return;
+    }
+    for (; bytes >= 16; bytes -= 16, to += 16, from += 16)
+        memcpy(to, from, 16);
+    for (; bytes >= 4; bytes -= 4, to += 4, from += 4)
+        memcpy(to, from, 4);
+    for (; bytes > 0; bytes--)
+        *to++ = *from++;
 }
 
 /* The sum of numbers with weights; integers wrap around. */
@@ -47,6 +63,16 @@ int64_t row_sums(int64_t rows, int64_t width, const int32_t *values,
     return GOOD;
 }
 
+/* Whether a row has the states of its fingerprint. */
+static int is_of(uint64_t left, int64_t place, int64_t leaves,
+                 const int32_t *const *values, const int64_t *widths,
+                 const int64_t *const *weights, int64_t upper)
+{
+    for (int64_t l = 0; l < leaves; l++)
+        left -= weighted(values[l] + place * widths[l], weights[l], widths[l]);
+    return ((int64_t)left >> 32) == upper;
+}
+
 /* _fingerprints.matches: which rows have the states of their fingerprints. */
 int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
                    int64_t leaves, const int32_t *const *values, const int64_t *widths,
@@ -55,7 +81,6 @@ int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
 {
     for (int64_t r = 0; r < rows; r++) {
         int64_t place = places ? places[r] : r;
-        uint64_t left;
         if (place < 0 || place >= length)
             return r;
         if (places && r + AHEAD < rows && places[r + AHEAD] >= 0
@@ -63,10 +88,8 @@ int64_t state_matches(int64_t rows, int64_t length, const int64_t *places,
             for (int64_t l = 0; l < leaves; l++)
                 fetch((const char *)(values[l] + places[r + AHEAD] * widths[l]),
                       widths[l] * (int64_t)sizeof(int32_t));
-        left = (uint64_t)known[place];
-        for (int64_t l = 0; l < leaves; l++)
-            left -= weighted(values[l] + place * widths[l], weights[l], widths[l]);
-        valid[r] = ((int64_t)left >> 32) == upper;
+        valid[r] = (uint8_t)is_of((uint64_t)known[place], place, leaves, values, widths,
+                                  weights, upper);
     }
     return GOOD;
 }
@@ -109,8 +132,8 @@ int64_t batch_donors(int64_t count, int64_t first, int64_t entities, int64_t win
                 is_chosen &= chosen[c];
             if (chance)
                 is_chosen &= chance[n * drawn + c] < swap_prob;
-            swapped[here] = is_chosen && total > 1;
-            missing += is_chosen && total <= 1;
+            swapped[here] = is_chosen & (total > 1);
+            missing += is_chosen & (total <= 1);
         }
         no_donor[n] = missing;
     }
@@ -137,8 +160,8 @@ int64_t buffer_donors(int64_t drawn, int64_t entities, const uint8_t *is_free,
                 is_chosen &= chosen[c];
             if (chance)
                 is_chosen &= chance[n * drawn + c] < swap_prob;
-            swapped[here] = is_chosen && size[n] > 0;
-            no_donor[n] += is_chosen && size[n] <= 0;
+            swapped[here] = is_chosen & (size[n] > 0);
+            no_donor[n] += is_chosen & (size[n] <= 0);
         }
     return GOOD;
 }
@@ -148,30 +171,29 @@ int64_t hindsight_sources(int64_t rows, const uint8_t *flags, const double *chan
                        const double *pick, double future, double random,
                        double counterfactual, int64_t *order, int64_t *source)
 {
-    int64_t size = 0, last;
+    int64_t size = 0, flagged = 0, last;
     for (int64_t r = 0; r < rows; r++)
-        if (flags[r])
-            order[size++] = r; /* counterfactual rows first */
+        size += flags[r];
     last = size;
-    for (int64_t r = 0; r < rows; r++)
-        if (!flags[r])
-            order[last++] = r;
+    for (int64_t r = 0; r < rows; r++) { /* counterfactual rows first */
+        int64_t end[2] = {last, flagged};
+        order[end[flags[r]]] = r;
+        flagged += flags[r];
+        last += !flags[r];
+    }
+    /* Of real rows and of counterfactual ones: the share that is relabelled, and where
+     * in the order the rows are that they draw among. Read from arrays, so that the
+     * processor need not guess what a row is. */
+    const double share[2] = {future + random, counterfactual};
+    const int64_t among[2] = {random > 0 ? rows - size : size, size};
+    const int64_t from[2] = {random > 0 ? size : 0, 0};
+    const double later = random > 0 ? future : future > 0 ? 2.0 : 0.0;
     for (int64_t r = 0; r < rows; r++) {
-        double share = flags[r] ? counterfactual : future + random;
-        int64_t among = size, first = 0;
-        if (!(chance[r] < share)) {
-            source[r] = r;
-            continue;
-        }
-        if (!flags[r] && future > 0 && (random <= 0 || chance[r] < future)) {
-            source[r] = r + 2 * rows;
-            continue;
-        }
-        if (random > 0 && !flags[r]) {
-            first = size;
-            among = rows - size;
-        }
-        source[r] = order[(int64_t)(pick[r] * (double)among) + first] + rows;
+        int64_t flag = flags[r];
+        int64_t place = (int64_t)(pick[r] * (double)among[flag]) + from[flag];
+        int64_t found[2] = {order[place] + rows, r + 2 * rows};
+        int64_t goal[2] = {r, found[(chance[r] < later) & !flag]};
+        source[r] = goal[chance[r] < share[flag]];
     }
     return GOOD;
 }
@@ -189,7 +211,7 @@ int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
         if (places && r + AHEAD < rows)
             __builtin_prefetch(source + places[r + AHEAD] * row_bytes + run_start[0]);
         for (int64_t i = 0; i < runs; i++) {
-            memcpy(out, from + run_start[i], (size_t)run_bytes[i]);
+            copy(out, from + run_start[i], run_bytes[i]);
             out += run_bytes[i];
         }
     }
@@ -205,56 +227,14 @@ int64_t relabel_rows(int64_t rows, int64_t width, int64_t bytes, const int64_t *
                      uint8_t *relabeled)
 {
     int64_t size = width * bytes;
+    const char *goal[3] = {desired, achieved, future};
     read_columns(rows, rows, 0, row_bytes, runs, run_start, run_bytes, values, achieved);
     for (int64_t r = 0; r < rows; r++) {
-        int64_t from = source[r];
-        const char *goal = desired + from * size;
+        int64_t from = source[r], kind = (from >= rows) + (from >= 2 * rows);
         if (from < 0 || from >= (future ? 3 : 2) * rows)
             return r;
-        if (from >= 2 * rows)
-            goal = future + (from - 2 * rows) * size;
-        else if (from >= rows)
-            goal = achieved + (from - rows) * size;
-        memcpy(goals + r * size, goal, (size_t)size);
-        relabeled[r] = from >= rows;
-    }
-    return GOOD;
-}
-
-/* Rows of a leaf, in which entities are those of their donors.
- *
- * An entity has runs of bytes in a row: run i is that of entity run_entity[i].
- */
-static int64_t swap_leaf(int64_t first, int64_t drawn, int64_t window, int64_t entities,
-               int64_t length, const int64_t *donors, const uint8_t *swapped, int64_t row_bytes,
-               int64_t runs, const int64_t *run_entity, const int64_t *run_start,
-               const int64_t *run_bytes, const char *own, const char *source, char *out)
-{
-    memcpy(out, own, (size_t)((first + drawn * window) * row_bytes));
-    out += first * row_bytes;
-    for (int64_t c = 0; c < drawn; c++) {
-        const uint8_t *is_swapped = swapped + c * entities;
-        if (c + AHEAD < drawn) {
-            int64_t later = (c + AHEAD) * entities;
-            for (int64_t i = 0; i < runs; i++)
-                if (swapped[later + run_entity[i]])
-                    fetch(source + run_start[i]
-                              + donors[later + run_entity[i]] * row_bytes,
-                          run_bytes[i]);
-        }
-        for (int64_t i = 0; i < runs; i++) {
-            int64_t entity = run_entity[i];
-            if (!is_swapped[entity])
-                continue;
-            int64_t donor = donors[c * entities + entity];
-            const char *from = source + donor * row_bytes;
-            char *to = out + c * window * row_bytes;
-            if (donor < 0 || donor > length - window)
-                return c * entities + entity;
-            for (int64_t w = 0; w < window; w++)
-                memcpy(to + w * row_bytes + run_start[i],
-                       from + w * row_bytes + run_start[i], (size_t)run_bytes[i]);
-        }
+        copy(goals + r * size, goal[kind] + (from - kind * rows) * size, size);
+        relabeled[r] = kind > 0;
     }
     return GOOD;
 }
@@ -275,23 +255,68 @@ int64_t uninfluenced(int64_t windows, int64_t window, int64_t entities,
     return GOOD;
 }
 
-/* swap.apply_swap: the rows of all leaves.
+/* Copies a run of bytes of the donors to each window of a list. */
+static void copy_run(int64_t count, const int64_t *listed, const int64_t *donors,
+                     int64_t entities, int64_t window, int64_t row_bytes,
+                     int64_t bytes, int64_t is_far, const char *source, char *out)
+{
+    int64_t ahead = window < AHEAD ? AHEAD / window : 1;
+    for (int64_t i = 0; i < count; i++) {
+        const char *from = source + donors[listed[i] * entities] * row_bytes;
+        char *to = out + listed[i] * window * row_bytes;
+        if (is_far && i + ahead < count) {
+            const char *later = source + donors[listed[i + ahead] * entities] * row_bytes;
+            for (int64_t w = 0; w < window; w++)
+                fetch(later + w * row_bytes, bytes);
+        }
+        for (int64_t w = 0; w < window; w++)
+            copy(to + w * row_bytes, from + w * row_bytes, bytes);
+    }
+}
+
+/* swap.apply_swap: the rows of all leaves, in which entities are those of their donors.
  *
- * A leaf has nine numbers in the table: those of its source, its bytes a row, its runs,
- * and the addresses of their entities, starts and lengths, of own, source and out.
+ * A leaf has nine numbers in the table: the rows of its source, its bytes a row, its
+ * runs of bytes, and the addresses of their entities, starts and lengths, of own, source
+ * and out. Swaps are listed before they are applied, so that the processor need not
+ * guess which entities are swapped.
  */
 int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities,
                   const int64_t *donors, const uint8_t *swapped, int64_t leaves,
                   const int64_t *table)
 {
-    for (; leaves > 0; leaves--, table += 9) {
-        int64_t bad = swap_leaf(
-            first, drawn, window, entities, table[0], donors, swapped, table[1], table[2],
-            (const int64_t *)table[3], (const int64_t *)table[4], (const int64_t *)table[5],
-            (const char *)table[6], (const char *)table[7], (char *)table[8]);
-        if (bad != GOOD)
-            return bad;
+    int64_t listed[LISTED], length = leaves ? table[0] : 0;
+    for (int64_t l = 0; l < leaves; l++) {
+        const int64_t *leaf = table + 9 * l;
+        length = leaf[0] < length ? leaf[0] : length;
+        memcpy((char *)leaf[8], (const char *)leaf[6],
+               (size_t)((first + drawn * window) * leaf[1]));
     }
+    for (int64_t begin = 0; begin < drawn; begin += LISTED)
+        for (int64_t n = 0; n < entities; n++) {
+            int64_t end = begin + LISTED < drawn ? begin + LISTED : drawn, count = 0;
+            for (int64_t c = begin; c < end; c++) {
+                listed[count] = c;
+                count += swapped[c * entities + n];
+            }
+            for (int64_t i = 0; i < count; i++) {
+                int64_t here = listed[i] * entities + n;
+                if (donors[here] < 0 || donors[here] > length - window)
+                    return here;
+            }
+            for (int64_t l = 0; l < leaves; l++) {
+                const int64_t *leaf = table + 9 * l;
+                const int64_t *owner = (const int64_t *)leaf[3];
+                const int64_t *start = (const int64_t *)leaf[4];
+                const int64_t *bytes = (const int64_t *)leaf[5];
+                for (int64_t i = 0; i < leaf[2]; i++)
+                    if (owner[i] == n)
+                        copy_run(count, listed, donors + n, entities, window, leaf[1],
+                                 bytes[i], leaf[6] != leaf[7],
+                                 (const char *)leaf[7] + start[i],
+                                 (char *)leaf[8] + first * leaf[1] + start[i]);
+            }
+        }
     return GOOD;
 }
 
@@ -345,32 +370,88 @@ int64_t batch_fits(const int64_t *number)
     return 1;
 }
 
-/* A batch with counterfactual windows, from random numbers: batch_donors, swap_rows and
- * the flags that CounterfactualTransform adds. NOT_FINITE if a state is not.
+/* BufferDonors.verified: takes back swaps whose donors have other states than those of
+ * their fingerprints. Returns how many. */
+static int64_t take_back(int64_t drawn, int64_t entities, int64_t window,
+                         const int64_t *donors, uint8_t *swapped, int64_t *no_donor,
+                         const int64_t *known, int64_t length, int64_t upper,
+                         int64_t leaves, const int32_t *const *values,
+                         const int64_t *widths, const int64_t *const *weights)
+{
+    int64_t found = 0;
+    for (int64_t here = 0; here < drawn * entities; here++) {
+        int64_t donor = donors[here], later = here + AHEAD, is_good = 1;
+        if (later < drawn * entities && swapped[later])
+            for (int64_t l = 0; l < leaves; l++)
+                fetch((const char *)(values[l] + donors[later] * widths[l]),
+                      widths[l] * (int64_t)sizeof(int32_t));
+        if (!swapped[here] || donor < 0 || donor > length - window)
+            continue;
+        for (int64_t r = donor; r < donor + window && is_good; r += window - 1) {
+            is_good = is_of((uint64_t)known[r], r, leaves, values, widths, weights, upper);
+            if (window == 1)
+                break;
+        }
+        if (!is_good) {
+            swapped[here] = 0;
+            no_donor[here % entities]++;
+            found++;
+        }
+    }
+    return found;
+}
+
+/* A batch with counterfactual windows, from random numbers: batch_donors or
+ * buffer_donors, swap_rows and the flags that CounterfactualTransform adds. Returns the
+ * first swap whose donor is out of range, NOT_FINITE if a state is not finite, or GOOD.
  *
  * Numbers: windows, first window that is drawn for, entities, window; the addresses of
  * is_free, order (a permutation of the windows, or 0), chance and share; how many
  * windows are chosen; the addresses of memory (listed, donors, no_donor; chosen,
  * swapped), of the counts that no_donor is added to, and of the flags; leaves and
- * states; for each leaf what swap_rows knows; for each state its address and size.
+ * states; the address of numbers about a storage that donors are from, or 0; how many
+ * swaps were taken back, which is written; for each leaf what swap_rows knows; for each
+ * state its address and size.
+ *
+ * About a storage: what buffer_donors knows of the eligible rows (the addresses of
+ * offset and size, how many there are, whether they are int32, their address); the
+ * address of the fingerprints, or 0; their number, the upper half of a fingerprint, the
+ * leaves of states; the addresses of those, of their widths and of their weights.
  */
-int64_t swap_batch(const int64_t *number, float swap_prob)
+int64_t swap_batch(int64_t *number, float swap_prob)
 {
     int64_t count = number[0], first = number[1], entities = number[2];
-    int64_t window = number[3], drawn = count - first;
+    int64_t window = number[3], drawn = count - first, bad;
+    const uint8_t *is_free = (const uint8_t *)number[4];
     const int64_t *order = (const int64_t *)number[5];
+    const float *chance = (const float *)number[6];
+    const double *share = (const double *)number[7];
     int64_t *listed = (int64_t *)number[9], *donors = listed + count;
     int64_t *no_donor = donors + drawn * entities, *total = (int64_t *)number[11];
     uint8_t *chosen = (uint8_t *)number[10], *swapped = chosen + drawn;
     uint8_t *chosen_flag = (uint8_t *)number[12], *swapped_flag = (uint8_t *)number[13];
     int64_t leaves = number[14], states = number[15];
-    const int64_t *leaf = number + 16, *state = leaf + 9 * leaves;
+    const int64_t *from = (const int64_t *)number[16], *leaf = number + 18;
+    const int64_t *state = leaf + 9 * leaves;
     for (int64_t c = 0; c < drawn; c++)
         chosen[c] = !order || order[c] < number[8];
-    batch_donors(count, first, entities, window, (const uint8_t *)number[4], chosen,
-                 (const float *)number[6], swap_prob, (const double *)number[7], listed,
-                 donors, swapped, no_donor);
-    swap_rows(first * window, drawn, window, entities, donors, swapped, leaves, leaf);
+    number[17] = 0;
+    if (!from)
+        batch_donors(count, first, entities, window, is_free, chosen, chance, swap_prob,
+                     share, listed, donors, swapped, no_donor);
+    else {
+        buffer_donors(drawn, entities, is_free + first * entities, chosen, chance,
+                      swap_prob, share, (const int64_t *)from[0], (const int64_t *)from[1],
+                      from[2], from[3], (const void *)from[4], donors, swapped, no_donor);
+        if (from[5])
+            number[17] = take_back(
+                drawn, entities, window, donors, swapped, no_donor, (const int64_t *)from[5],
+                from[6], from[7], from[8], (const int32_t *const *)from[9],
+                (const int64_t *)from[10], (const int64_t *const *)from[11]);
+    }
+    bad = swap_rows(first * window, drawn, window, entities, donors, swapped, leaves, leaf);
+    if (bad != GOOD)
+        return bad;
     for (int64_t i = 0; i < states; i++)
         if (!all_finite(state[2 * i + 1], (const int32_t *)state[2 * i]))
             return NOT_FINITE;
@@ -381,7 +462,8 @@ int64_t swap_batch(const int64_t *number, float swap_prob)
     for (int64_t c = 0; c < drawn; c++)
         for (int64_t r = (first + c) * window; r < (first + c + 1) * window; r++) {
             chosen_flag[r] = chosen[c];
-            memcpy(swapped_flag + r * entities, swapped + c * entities, (size_t)entities);
+            copy((char *)swapped_flag + r * entities, (const char *)swapped + c * entities,
+                 entities);
         }
     return GOOD;
 }

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 
 from torchrl_caiac._sampling import on_cuda as cuda
 from torchrl_caiac._sampling.draws import batch_donors
-from torchrl_caiac._sampling.on_cpu import GOOD, call, call_with_rows
+from torchrl_caiac._sampling.on_cpu import GOOD, addresses, call, call_with_rows
 from torchrl_caiac._sampling.rows import device_numbers
 from torchrl_caiac._sampling.runs import Runs
 
-__all__ = ["swap_batch", "swap_rows"]
+__all__ = ["DonorRows", "SwappedBatch", "swap_batch", "swap_rows"]
 
 
 def swap_rows(
@@ -82,6 +83,51 @@ def _leaf_fields(
     return [*places, len(source), width, own.element_size(), owner, entity]
 
 
+class DonorRows(NamedTuple):
+    """The rows of a storage that donors are drawn from, on the CPU.
+
+    Attributes:
+        starts (torch.Tensor): eligible rows, int32 or int64 ``[M]``, entity by entity.
+        offset (torch.Tensor): where those of an entity begin, int64 ``[N]``.
+        size (torch.Tensor): how many it has, int64 ``[N]``.
+        sources (sequence of torch.Tensor): for each leaf that is swapped the rows of
+            the storage, ``[T, ...]``.
+        known (torch.Tensor, optional): their fingerprints, int64 ``[T]``; ``None`` if
+            they are not compared.
+        states (sequence of tuple): for each leaf of states and next states the rows,
+            float32 ``[T, L]``, and the weights of its hash, int64 ``[L]``.
+        upper (int): the upper half of a fingerprint, less the hash of the states.
+    """
+
+    starts: torch.Tensor
+    offset: torch.Tensor
+    size: torch.Tensor
+    sources: Sequence[torch.Tensor]
+    known: torch.Tensor | None
+    states: Sequence[tuple[torch.Tensor, torch.Tensor]]
+    upper: int
+
+
+class SwappedBatch(NamedTuple):
+    """What :func:`swap_batch` returns.
+
+    Attributes:
+        leaves (list of torch.Tensor): the new leaves, ``[B * window, ...]``.
+        counterfactual (torch.Tensor): which rows are counterfactual, bool
+            ``[B * window, 1]``.
+        swapped (torch.Tensor): which entities are swapped, bool ``[B * window, N]``.
+        is_finite (bool): whether all states are finite.
+        is_stale (bool): whether swaps were taken back, as their donors have other
+            states than those of their fingerprints.
+    """
+
+    leaves: list[torch.Tensor]
+    counterfactual: torch.Tensor
+    swapped: torch.Tensor
+    is_finite: bool
+    is_stale: bool
+
+
 def swap_batch(
     free: torch.Tensor,
     order: torch.Tensor | None,
@@ -93,10 +139,12 @@ def swap_batch(
     leaves: Sequence[tuple[torch.Tensor, Runs]],
     states: Sequence[int | torch.Tensor],
     no_donor: torch.Tensor,
-) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, bool]:
-    """Swaps entities between the windows of a batch.
+    donors: DonorRows | None = None,
+) -> SwappedBatch:
+    """Swaps entities between the windows of a batch, or with those of a storage.
 
-    The same as :func:`batch_donors` and :func:`swap_rows`, and the flags of the rows.
+    The same as :func:`batch_donors` or :func:`buffer_donors` and :func:`swap_rows`, and
+    the flags of the rows.
 
     Args:
         free (torch.Tensor): bool ``[B, N]``, the entities that may be swapped.
@@ -104,7 +152,8 @@ def swap_batch(
             number below ``count`` become counterfactual; on a CUDA device which ones
             do, bool. The last ``count`` windows do if it is ``None``.
         chance (torch.Tensor, optional): float32 ``[N, C]``, below 1.
-        share (torch.Tensor): float64 ``[N, C]``, below 1: which donor it is.
+        share (torch.Tensor): float64, below 1: which donor it is, ``[N, C]``, in the
+            order ``[C, N]`` if it is one of a storage.
         count (int): the number of windows that become counterfactual.
         window (int): rows in a window.
         swap_prob (float): the chance below which a free entity is swapped.
@@ -114,11 +163,14 @@ def swap_batch(
             float32: places in ``leaves``, or other tensors. Only on the CPU.
         no_donor (torch.Tensor): int64 ``[N]``, to which the windows are added in which
             an entity had no donor.
+        donors (DonorRows, optional): the storage that donors are from; ``None`` for the
+            batch. Only on the CPU.
 
     Returns:
-        tuple: the new leaves; which rows are counterfactual, bool ``[B * window, 1]``;
-        which entities are swapped, bool ``[B * window, N]``; and whether all states are
-        finite.
+        SwappedBatch: the leaves and flags.
+
+    Raises:
+        IndexError: a donor is not a row of the storage.
     """
     windows, entities = free.shape
     drawn = share.shape[1]
@@ -132,20 +184,49 @@ def swap_batch(
     flags = free.new_empty(drawn * (entities + 1))
     chosen = free.new_empty(rows, 1)
     swapped = free.new_empty(rows, entities)
+    storage = None if donors is None else _storage_numbers(donors)
     table = [
         *(windows, windows - drawn, entities, window),
         *map(cuda.address, (free, order, chance, share)),
         count,
         *map(cuda.address, (numbers, flags, no_donor, chosen, swapped)),
         *(len(leaves), len(states)),
+        0 if storage is None else ctypes.addressof(storage[0]),
+        0,
     ]
-    for (own, runs), out in zip(leaves, outs, strict=True):
-        table += _table_row(own, own, runs, out)
+    sources = [own for own, _ in leaves] if donors is None else donors.sources
+    for (own, runs), source, out in zip(leaves, sources, outs, strict=True):
+        table += _table_row(own, source, runs, out)
     for state in states:
         tensor = outs[state] if isinstance(state, int) else state
         table += [tensor.data_ptr(), tensor.numel()]
-    found = call("swap_batch", (ctypes.c_int64 * len(table))(*table), swap_prob)
-    return outs, chosen, swapped, found == GOOD
+    given = (ctypes.c_int64 * len(table))(*table)
+    found = call("swap_batch", given, swap_prob)
+    if found >= 0:
+        row = int(numbers[windows + found])
+        raise IndexError(
+            f"row {row} is out of range: there are {min(map(len, sources))} rows"
+        )
+    return SwappedBatch(outs, chosen, swapped, found == GOOD, given[17] > 0)
+
+
+def _storage_numbers(donors: DonorRows) -> tuple[Any, ...]:
+    """Returns what ``swap_batch`` in C knows of a storage, and what has to be kept."""
+    values = [leaf for leaf, _ in donors.states]
+    weights = [weight for _, weight in donors.states]
+    kept = (
+        addresses(values),
+        (ctypes.c_int64 * len(values))(*(leaf.shape[1] for leaf in values)),
+        addresses(weights),
+    )
+    known, starts = donors.known, donors.starts
+    numbers = [
+        *(donors.offset.data_ptr(), donors.size.data_ptr(), starts.shape[0]),
+        *(starts.dtype is torch.int32, starts.data_ptr(), cuda.address(known)),
+        *(0 if known is None else known.shape[0], donors.upper, len(values)),
+        *map(ctypes.addressof, kept),
+    ]
+    return (ctypes.c_int64 * len(numbers))(*numbers), kept
 
 
 def _swap_cuda_batch(
@@ -157,7 +238,7 @@ def _swap_cuda_batch(
     swap_prob: float,
     leaves: Sequence[tuple[torch.Tensor, Runs]],
     no_donor: torch.Tensor,
-) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, bool]:
+) -> SwappedBatch:
     first = len(free) - share.shape[1]
     donors, swapped, missing = batch_donors(
         free, len(free) - first, window, swap_prob, chosen, chance, share
@@ -176,7 +257,7 @@ def _swap_cuda_batch(
             torch.cat([x.new_zeros(first * window, x.shape[1]), x])
             for x in (flags, swapped)
         )
-    return outs, flags, swapped, True
+    return SwappedBatch(outs, flags, swapped, is_finite=True, is_stale=False)
 
 
 def _table_row(

@@ -481,6 +481,7 @@ class CounterfactualTransform(RandomTransform, ABC):
                 no_donor=self._no_donor,
                 generator=self.generator,
                 batch_check=self._batch_check,
+                donors=next(iter(self._donors), None),
             )
             if done is not None:
                 return done
@@ -523,11 +524,11 @@ class CounterfactualTransform(RandomTransform, ABC):
     @property
     def _settings(self) -> SwapSettings | None:
         """The settings of repeated swaps, ``None`` if all are done step by step."""
-        if self._donors or self._goal_leaves or self.unscored == "keep":
+        if self._goal_leaves or self.unscored == "keep":
             return None
         if self.draw_in_batch is not draw_batch_donors:
             return None
-        on_gpu = self._lookahead is None
+        on_gpu = self._lookahead is None and not self._donors
         return SwapSettings(self.window, self.score_key, self.keys, self.check, on_gpu)
 
     def _swappable_in(self, td: TensorDictBase, scores: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,13 @@ from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac._checks import check_local
-from torchrl_caiac._fingerprints import fingerprint_key, matches
+from torchrl_caiac._fingerprints import (
+    fingerprint_key,
+    hashed_leaves,
+    matches,
+    upper_half,
+)
+from torchrl_caiac._sampling import DonorRows, is_native
 from torchrl_caiac._torchrl import storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
@@ -22,6 +28,7 @@ from torchrl_caiac.transforms.draws import (
     DonorIndex,
     SwapDraw,
     draw_buffer_donors,
+    is_native_index,
 )
 from torchrl_caiac.transforms.indexing import plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -210,6 +217,9 @@ class BufferDonors:
         )
         # The donors' leaves for the last plan, and the tensordict that they come from.
         self._read: tuple[SwapPlan, TensorDictBase, list[torch.Tensor]] | None = None
+        # The same for functions in C, and whether fingerprints are compared.
+        self._rows: tuple[SwapPlan, TensorDictBase, bool, DonorRows | None] | None
+        self._rows = None
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
@@ -250,7 +260,7 @@ class BufferDonors:
         revision = self.storage, storage_revision(self.storage)
         if self._built is None or self._built[0] != revision:
             self._built = (revision, *self._build())
-            self._read = None
+            self._read = self._rows = None
         return self._built[1:]
 
     def _build(self) -> tuple[Any, TrajectoryIndex | None, TensorDictBase]:
@@ -381,7 +391,8 @@ class BufferDonors:
             return td.copy()
         known = self._read
         if known is None or known[0] is not plan or known[1] is not data:
-            self._read = known = plan, data, self._sources(data, plan, values)
+            own = [values[leaf.place] for leaf in plan.leaves]
+            self._read = known = plan, data, self._sources(data, plan, own)
         sources, goals = known[2], self.goals
 
         def donor_goals(leaf: SwapLeaf) -> torch.Tensor:
@@ -401,12 +412,11 @@ class BufferDonors:
         )
 
     def _sources(
-        self, data: TensorDictBase, plan: SwapPlan, values: Sequence[torch.Tensor]
+        self, data: TensorDictBase, plan: SwapPlan, batch: Sequence[torch.Tensor]
     ) -> list[torch.Tensor]:
-        """Returns the donors' leaves in the order of the plan's, of the same rows."""
+        """Returns the donors' leaves in the order of the batch's, of the same rows."""
         found = []
-        for leaf in plan.leaves:
-            own = values[leaf.place]
+        for leaf, own in zip(plan.leaves, batch, strict=True):
             if leaf.is_desired and self.goals is not None:
                 found.append(torch.empty(0))  # is not read
                 continue
@@ -440,11 +450,71 @@ class BufferDonors:
             found.append(plain_tensor(source))
         return found
 
+    def rows(
+        self, plan: SwapPlan, batch: Sequence[torch.Tensor], check: bool
+    ) -> DonorRows | None:
+        """Returns the donors as :func:`~torchrl_caiac._sampling.swap_batch` reads them.
+
+        Args:
+            plan (SwapPlan): the plan of a batch.
+            batch (sequence of torch.Tensor): its leaves, in the order of the plan's.
+            check (bool): whether fingerprints are compared, see :meth:`verified`.
+
+        Returns:
+            DonorRows, optional: ``None`` if donors are drawn and read by the other
+            methods.
+        """
+        index, trajectories, data = self.index()
+        known = self._rows
+        if (
+            known is None
+            or known[0] is not plan
+            or known[1] is not data
+            or known[2] != check
+        ):
+            is_in_order = trajectories is None or trajectories.is_storage_order
+            found = None
+            if is_in_order and self.goals is None and isinstance(index, DonorIndex):
+                found = self._native_rows(index, data, plan, batch, check)
+            self._rows = known = plan, data, check, found
+        return known[3]
+
+    def _native_rows(
+        self,
+        index: DonorIndex,
+        data: TensorDictBase,
+        plan: SwapPlan,
+        batch: Sequence[torch.Tensor],
+        check: bool,
+    ) -> DonorRows | None:
+        layout, sources = self.layout, self._sources(data, plan, batch)
+        known = data.get(fingerprint_key(self.score_key), None) if check else None
+        states: Sequence[tuple[torch.Tensor, torch.Tensor]] | None = []
+        if known is not None:
+            known = plain_tensor(known)
+            after = [layout.next(key) for key in layout.in_keys]
+            states = hashed_leaves(data, layout.in_keys, after, len(known))
+        if (
+            states is None
+            or (known is not None and known.dtype is not torch.int64)
+            or not is_native_index(index, len(layout))
+            or not is_native(
+                sources=[
+                    *sources,
+                    *([] if known is None else [known]),
+                    *(leaf for leaf, _ in states),
+                ]
+            )
+        ):
+            return None
+        upper = upper_half(tuple(layout.names))
+        return DonorRows(*index, sources, known, states, upper)
+
     def refresh(self) -> None:
         """Drops the index: needed only after writing to the storage's raw tensors."""
-        self._built = self._read = None
+        self._built = self._read = self._rows = None
         if self.lookahead is not None:
             self.lookahead.refresh()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_built": None, "_read": None}
+        return {**self.__dict__, "_built": None, "_read": None, "_rows": None}

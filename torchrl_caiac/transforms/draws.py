@@ -317,6 +317,25 @@ def _is_native_draw(
     return is_fit and is_native(free, chosen, sources=index)
 
 
+def is_native_index(index: DonorIndex, entities: int) -> bool:
+    """Returns whether functions in C or CUDA can draw from an index.
+
+    Args:
+        index (DonorIndex): the eligible windows.
+        entities (int): the number of entities, ``N``.
+
+    Returns:
+        bool: whether they are in memory as :func:`draw_buffer_donors` expects.
+    """
+    return (
+        len(index.starts) > 0
+        and index.starts.dtype in (torch.int32, torch.int64)
+        and index.offset.dtype == index.size.dtype == torch.int64
+        and len(index.offset) == len(index.size) == entities
+        and is_native(index.size, sources=index)
+    )
+
+
 def _chance(free: torch.Tensor, generator: torch.Generator | None) -> torch.Tensor:
     return draw_numbers(
         torch.rand,
@@ -467,20 +486,13 @@ def draw_buffer_donors(
     device = free.device
     if (
         isinstance(index, DonorIndex)
-        and len(index.starts)
-        and index.starts.dtype in (torch.int32, torch.int64)
-        and index.offset.dtype == index.size.dtype == torch.int64
-        and len(index.offset) == len(index.size) == free.shape[1]
+        and is_native_index(index, free.shape[1])
         and _is_native_draw(free, chosen, len(free), index)
     ):
-        chance = None if swap_prob >= 1.0 else _chance(free.t(), generator)
-        share = draw_numbers(
-            torch.rand,
-            free.shape,
-            device=device,
-            generator=generator,
-            dtype=torch.float64,
+        chance, share = donor_numbers(
+            *free.t().shape, swap_prob, device=device, generator=generator
         )
+        share = share.view(free.shape)
         drawn = buffer_donors(free, *index, swap_prob, chosen, chance, share)
         return SwapDraw(*drawn, chosen=chosen)
     is_chosen = _drawn(free.t(), swap_prob, chosen, generator).t()

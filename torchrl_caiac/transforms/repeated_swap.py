@@ -14,6 +14,7 @@ from torchrl_caiac._batches import KnownBatch
 from torchrl_caiac._fingerprints import fingerprint_key, leaf_weights, upper_half
 from torchrl_caiac._sampling import (
     MOST_LEAVES,
+    DonorRows,
     batch_fits,
     is_native,
     rows_fit,
@@ -24,6 +25,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flag_keys
 from torchrl_caiac.transforms.batch_check import BatchCheck, CheckedScores
 from torchrl_caiac.transforms.checks import LateCheck
+from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.draws import (
     donor_numbers,
     draw_windows,
@@ -200,6 +202,7 @@ class RepeatedSwap:
         no_donor: torch.Tensor,
         generator: torch.Generator | None,
         batch_check: BatchCheck,
+        donors: BufferDonors | None,
     ) -> TensorDictBase | None:
         """Swaps entities in a batch.
 
@@ -216,6 +219,7 @@ class RepeatedSwap:
                 no donor, which are counted.
             generator (torch.Generator, optional): source of randomness.
             batch_check (BatchCheck): raises the errors.
+            donors (BufferDonors, optional): the donor buffer; ``None`` for the batch.
 
         Returns:
             TensorDictBase, optional: the batch with counterfactual windows; ``None`` if
@@ -229,6 +233,11 @@ class RepeatedSwap:
         window, _, keys, check, _ = self.settings
         if leaves is None:
             return None
+        donor_rows: DonorRows | None = None
+        if donors is not None:
+            donor_rows = donors.rows(self._plan, leaves["swapped"], check)
+            if donor_rows is None:
+                return None
         scores = leaves["scores"][0]
         if not 0 < count <= len(scores) // window:
             return None
@@ -263,7 +272,7 @@ class RepeatedSwap:
         chance, share = donor_numbers(
             entities, drawn, swap_prob, device=free.device, generator=generator
         )
-        new, chosen, swapped, is_finite = swap_batch(
+        new = swap_batch(
             free,
             order,
             chance,
@@ -274,17 +283,21 @@ class RepeatedSwap:
             list(zip(leaves["swapped"], self._runs, strict=True)),
             [*self._finite, *leaves["kept"]],
             no_donor,
+            donor_rows,
         )
+        if donors is not None and new.is_stale:
+            donors.refresh()
         found = {
-            leaf.key: value for leaf, value in zip(self._plan.leaves, new, strict=True)
+            leaf.key: value
+            for leaf, value in zip(self._plan.leaves, new.leaves, strict=True)
         }
-        found[keys.counterfactual] = chosen
-        found[keys.swapped] = swapped
+        found[keys.counterfactual] = new.counterfactual
+        found[keys.swapped] = new.swapped
         out = self._batch.copy(td, found)
         if check and is_late:
             seen = CheckedScores(scores, is_valid=valid if window == 1 else None)
             batch_check.after(out, seen, self._plan.states)
-        elif not is_finite:
+        elif not new.is_finite:
             batch_check.explain_states(out, self._plan.states)
         return out
 
