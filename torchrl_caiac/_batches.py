@@ -49,7 +49,9 @@ def with_leaves(
         *parents, name = (key,) if isinstance(key, str) else key
         node, entries = out, entries_of(out)
         for parent in parents:
-            node = None if entries is None else entries.get(parent)
+            if entries is not None and parent not in entries:
+                entries[parent] = tensordict_of({}, shape, device)
+            node = None if entries is None else entries[parent]
             entries = entries_of(node)
         if (
             entries is not None
@@ -87,10 +89,8 @@ class KnownBatch:
     """
 
     def __init__(self, td: TensorDictBase, keys: Sequence[NestedKey]) -> None:
-        # The names of the entries of each node, and which of them are tensors.
-        self._nodes: dict[tuple[str, ...], tuple[tuple[str, ...], list[bool]]] = {}
-        # Entries without tensors, such as texts, which copies share.
-        self._others: list[tuple[tuple[str, ...], str, type]] = []
+        # The names of the entries of each node, and their classes.
+        self._nodes: dict[tuple[str, ...], tuple[tuple[str, ...], list[type]]] = {}
         self._shape, self._device = td.batch_size, td.device
         self._walk(td, ())
         self._keys = [((key,) if isinstance(key, str) else tuple(key)) for key in keys]
@@ -102,12 +102,11 @@ class KnownBatch:
             raise TypeError(f"{path} is a {type(td).__name__}")
         if (td.batch_size, td.device) != (self._shape, self._device):
             raise TypeError(f"{path} has another batch size or device")
-        are_tensors = [isinstance(entry, Tensor) for entry in entries.values()]
-        self._nodes[path] = tuple(entries), are_tensors
+        self._nodes[path] = tuple(entries), list(map(type, entries.values()))
         for name, entry in entries.items():
-            if is_non_tensor(entry):
-                self._others.append((path, name, type(entry)))
-            elif not isinstance(entry, Tensor) and is_tensor_collection(entry):
+            # Entries without tensors, such as texts, are shared by copies.
+            is_leaf = isinstance(entry, Tensor) or is_non_tensor(entry)
+            if not is_leaf and is_tensor_collection(entry):
                 self._walk(entry, (*path, name))
 
     def leaves(self, td: Any) -> list[Tensor] | None:
@@ -123,23 +122,19 @@ class KnownBatch:
             list of torch.Tensor, optional: the leaves, in the order of the keys.
         """
         nodes: dict[tuple[str, ...], dict[str, Any]] = {}
-        for path, (names, are_tensors) in self._nodes.items():
+        for path, (names, kinds) in self._nodes.items():
             node = nodes[path[:-1]][path[-1]] if path else td
             entries = entries_of(node)
             if (
                 entries is None
                 or tuple(entries) != names
-                or [isinstance(x, Tensor) for x in entries.values()] != are_tensors
+                or list(map(type, entries.values())) != kinds
                 or node.batch_size != self._shape
                 or node.device != self._device
                 or names_of(node) is not None
             ):
                 return None
             nodes[path] = entries
-        if any(
-            type(nodes[path][name]) is not kind for path, name, kind in self._others
-        ):
-            return None
         found = [nodes[key[:-1]][key[-1]] for key in self._keys]
         return found if list(map(_kind, found)) == self._kinds else None
 

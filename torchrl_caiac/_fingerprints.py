@@ -191,7 +191,7 @@ def hashed_leaves(
     next_keys: Sequence[NestedKey],
     length: int,
 ) -> list[tuple[torch.Tensor, torch.Tensor]] | None:
-    """Returns the leaves that are hashed, and their weights, as functions in C read them.
+    """Returns the leaves that are hashed, and their weights, for functions in C.
 
     Args:
         td (TensorDictBase): the rows, ``[T]``.

@@ -11,6 +11,7 @@ from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac._checks import check_local
 from torchrl_caiac._keys import missing_key, path
+from torchrl_caiac._sampling import is_native, rows_ahead
 from torchrl_caiac._torchrl import (
     is_in_order_of_time,
     last_written,
@@ -114,6 +115,26 @@ class TrajectoryIndex(NamedTuple):
         if self.order is None and self.oldest:
             return (rows + steps) % self.length
         return self.rows((self.position(rows) + steps).clamp_max(self.length - 1))
+
+    def ahead(self, rows: torch.Tensor, steps: torch.Tensor) -> torch.Tensor:
+        """Returns the rows that are ``steps`` later, or the trajectory's last ones.
+
+        Args:
+            rows (torch.Tensor): int64 ``[B]``.
+            steps (torch.Tensor): int64 ``[B]``, at least 0.
+
+        Returns:
+            torch.Tensor: int64 ``[B]``.
+        """
+        if (
+            self.order is None
+            and rows.dtype is steps.dtype is torch.int64
+            and rows.shape == steps.shape
+            and rows.device.type == "cpu"
+            and is_native(rows, steps, sources=[self.left])
+        ):
+            return rows_ahead(rows, steps, self.left)
+        return self.later(rows, torch.minimum(steps, self.remaining(rows)))
 
     def numbers(self) -> torch.Tensor:
         """Returns the trajectory of each row, 0, 1, ... by time, int64 ``[T]``."""

@@ -9,7 +9,11 @@ from torchrl_caiac._sampling.draws import (
     batch_donors,
     buffer_donors,
     chosen_windows,
+)
+from torchrl_caiac._sampling.goals import (
     hindsight_sources,
+    relabel_batch,
+    relabel_rows,
 )
 from torchrl_caiac._sampling.native import is_native, only_torch, plain
 from torchrl_caiac._sampling.on_cuda import LEAVES as MOST_LEAVES
@@ -19,8 +23,8 @@ from torchrl_caiac._sampling.rows import (
     free_windows,
     look,
     read_columns,
-    relabel_rows,
     row_sums,
+    rows_ahead,
     rows_equal,
     rows_fit,
     state_matches,
@@ -45,8 +49,10 @@ __all__ = [
     "only_torch",
     "plain",
     "read_columns",
+    "relabel_batch",
     "relabel_rows",
     "row_sums",
+    "rows_ahead",
     "rows_equal",
     "rows_fit",
     "state_matches",

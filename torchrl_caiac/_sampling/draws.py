@@ -1,4 +1,4 @@
-"""From random numbers to donors and goals, in C or CUDA."""
+"""From random numbers to donors, in C or CUDA."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from torchrl_caiac._sampling import on_cuda as cuda
 from torchrl_caiac._sampling.on_cpu import call
 
-__all__ = ["batch_donors", "buffer_donors", "chosen_windows", "hindsight_sources"]
+__all__ = ["batch_donors", "buffer_donors", "chosen_windows"]
 
 
 def batch_donors(
@@ -147,50 +147,3 @@ def chosen_windows(number: torch.Tensor, count: int) -> torch.Tensor:
     fields = len(number), count, number.data_ptr(), chosen.data_ptr()
     cuda.start("chosen_windows", number.device, (cuda.blocks(len(number)), 1), fields)
     return chosen
-
-
-def hindsight_sources(
-    flags: torch.Tensor,
-    chance: torch.Tensor,
-    pick: torch.Tensor,
-    future: float,
-    random: float,
-    counterfactual: float,
-) -> torch.Tensor:
-    """Returns where the goals of rows come from, from random numbers.
-
-    Args:
-        flags (torch.Tensor): which rows are counterfactual, bool ``[B]``.
-        chance (torch.Tensor): float64 ``[B]``, below 1: whether a row is relabelled.
-        pick (torch.Tensor): float64 ``[B]``, below 1: whose goal it gets.
-        future (float): the share of real rows that get a future goal.
-        random (float): the share of real rows that get that of another one.
-        counterfactual (float): the share of counterfactual rows that are relabelled.
-
-    Returns:
-        torch.Tensor: int64 ``[B]``, below ``3 B``, see ``HindsightDraw``.
-    """
-    found = flags.new_empty(2, len(flags), dtype=torch.int64)
-    order, source = found.unbind()
-    if flags.is_cuda:
-        fields = [
-            len(flags),
-            *map(cuda.address, (flags, chance, pick)),
-            *(future, random, counterfactual),
-            *map(cuda.address, (order, source)),
-        ]
-        cuda.start("hindsight_sources", flags.device, (1, 1), fields)
-        return source
-    call(
-        "hindsight_sources",
-        len(flags),
-        flags,
-        chance,
-        pick,
-        future,
-        random,
-        counterfactual,
-        order,
-        source,
-    )
-    return source

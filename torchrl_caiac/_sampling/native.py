@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import partial
 
 import torch
 
@@ -54,23 +53,22 @@ def is_native(*tensors: torch.Tensor, sources: Sequence[torch.Tensor] = ()) -> b
     if _off.get() or torch.compiler.is_compiling():
         return False
     device = tensors[0].device if tensors else torch.device("cpu")
-    if not all(map(partial(_is_plain, device=device), (*tensors, *sources))):
-        return False
+    for tensor in (*tensors, *sources):
+        if (
+            type(tensor) not in PLAIN
+            or tensor.device != device
+            or not tensor.is_contiguous()
+            or tensor.requires_grad
+            or tensor.is_neg()
+            or tensor.is_conj()
+            or (tensor.data_ptr() == 0 and tensor.numel() > 0)
+        ):
+            return False
     if device.type != "cpu":
         return on_cuda.is_there(device)
     if torch.get_num_threads() > 1 and any(x.numel() > _MOST for x in tensors):
         return False
     return library() is not None
-
-
-def _is_plain(tensor: torch.Tensor, device: torch.device) -> bool:
-    return (
-        type(tensor) in PLAIN
-        and tensor.device == device
-        and tensor.is_contiguous()
-        and not (tensor.requires_grad or tensor.is_neg() or tensor.is_conj())
-        and (tensor.data_ptr() != 0 or not tensor.numel())
-    )
 
 
 def plain(tensor: torch.Tensor) -> torch.Tensor:

@@ -15,12 +15,13 @@ from torchrl_caiac._sampling.runs import Runs
 __all__ = [
     "all_finite",
     "batch_fits",
+    "column_runs",
     "device_numbers",
     "free_windows",
     "look",
     "read_columns",
-    "relabel_rows",
     "row_sums",
+    "rows_ahead",
     "rows_equal",
     "rows_fit",
     "state_matches",
@@ -100,6 +101,29 @@ def state_matches(
     return valid
 
 
+def rows_ahead(
+    rows: torch.Tensor, steps: torch.Tensor, left: torch.Tensor
+) -> torch.Tensor:
+    """Returns rows that are some steps later, in a ring, on the CPU.
+
+    Args:
+        rows (torch.Tensor): int64 ``[B]``.
+        steps (torch.Tensor): int64 ``[B]``, at least 0.
+        left (torch.Tensor): int32 or int64 ``[T]``, the most steps from each row.
+
+    Returns:
+        torch.Tensor: int64 ``[B]``.
+    """
+    found = torch.empty_like(rows)
+    count, length = rows.shape[0], left.shape[0]
+    is_short = left.dtype is torch.int32
+    call_with_rows(
+        *("rows_ahead", rows, length, count, length),
+        *(rows, steps, is_short, left, found),
+    )
+    return found
+
+
 def rows_equal(own: torch.Tensor, source: torch.Tensor, rows: torch.Tensor) -> bool:
     """Returns whether rows are those of a source to the bit, on the CPU.
 
@@ -141,7 +165,7 @@ def read_columns(
         blocks = cuda.blocks(out.numel())
         cuda.start("read_columns", source.device, (blocks, 1), fields)
         return out
-    runs = _column_runs(tuple(columns), source.element_size())
+    runs = column_runs(tuple(columns), source.element_size())
     call_with_rows(
         "read_columns",
         rows,
@@ -159,59 +183,14 @@ def read_columns(
     return out
 
 
-def relabel_rows(
-    desired: torch.Tensor,
-    values: torch.Tensor,
-    columns: Sequence[int],
-    future: torch.Tensor | None,
-    source: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Returns the goals of rows by their sources.
-
-    Args:
-        desired (torch.Tensor): the desired goals, ``[B, G]``.
-        values (torch.Tensor): what goals are achieved in, ``[B, D]``.
-        columns (sequence of int): its columns that are the achieved goals, ``G``.
-        future (torch.Tensor, optional): future goals, ``[B, G]``.
-        source (torch.Tensor): the row of the three together that each goal is, int64
-            ``[B]``.
-
-    Returns:
-        tuple of torch.Tensor: the goals and the achieved goals, ``[B, G]``, and which
-        rows have another goal than their desired one, bool ``[B, 1]``.
-    """
-    rows, width = desired.shape
-    goals, achieved = torch.empty_like(desired), torch.empty_like(desired)
-    relabeled = desired.new_empty(rows, 1, dtype=torch.bool)
-    size = desired.element_size()
-    given = source, desired, future, values
-    if desired.is_cuda:
-        column = device_numbers(tuple(columns), desired.device)
-        fields = [
-            *(rows, width, size, *map(cuda.address, given), values.shape[1]),
-            *map(cuda.address, (column, goals, achieved, relabeled)),
-        ]
-        blocks = cuda.blocks(desired.numel())
-        cuda.start("relabel_rows", desired.device, (blocks, 1), fields)
-        return goals, achieved, relabeled
-    runs = _column_runs(tuple(columns), size)
-    call_with_rows(
-        "relabel_rows",
-        source,
-        (2 if future is None else 3) * rows,
-        *(rows, width, size, *given, values.shape[1] * size, len(runs.start)),
-        *(runs.start, runs.length, goals, achieved, relabeled),
-    )
-    return goals, achieved, relabeled
-
-
 @lru_cache(maxsize=256)
 def device_numbers(numbers: tuple[int, ...], device: torch.device) -> torch.Tensor:
     return torch.tensor(numbers, dtype=torch.int64, device=device)
 
 
 @lru_cache(maxsize=64)
-def _column_runs(columns: tuple[int, ...], itemsize: int) -> Runs:
+def column_runs(columns: tuple[int, ...], itemsize: int) -> Runs:
+    """Returns where columns are in a row."""
     return Runs.of_columns([(0, column) for column in columns], itemsize)
 
 

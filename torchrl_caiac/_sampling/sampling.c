@@ -12,6 +12,7 @@
 #define NEXT 0x9E3779B97F4A7C15u /* of _fingerprints */
 #define LINE 64 /* bytes of a cache line */
 #define AHEAD 8 /* rows whose donors are fetched before they are needed */
+#define TOGETHER 16 /* entities that are compared at a time */
 #define LISTED 512 /* windows whose swaps are listed at a time */
 
 /* Fetches memory that is needed soon. */
@@ -30,8 +31,14 @@ static inline void copy(char *to, const char *from, int64_t bytes)
     }
     for (; bytes >= 16; bytes -= 16, to += 16, from += 16)
         memcpy(to, from, 16);
-    for (; bytes >= 4; bytes -= 4, to += 4, from += 4)
+    if (bytes >= 8) {
+        memcpy(to, from, 8);
+        bytes -= 8, to += 8, from += 8;
+    }
+    if (bytes >= 4) {
         memcpy(to, from, 4);
+        bytes -= 4, to += 4, from += 4;
+    }
     for (; bytes > 0; bytes--)
         *to++ = *from++;
 }
@@ -218,6 +225,22 @@ int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
     return GOOD;
 }
 
+/* TrajectoryIndex.ahead: rows that are some steps later, at most the last one of their
+ * trajectory. */
+int64_t rows_ahead(int64_t count, int64_t length, const int64_t *rows,
+                   const int64_t *steps, int64_t is_short, const void *left, int64_t *out)
+{
+    for (int64_t r = 0; r < count; r++) {
+        int64_t row = rows[r], most;
+        if (row < 0 || row >= length || steps[r] < 0)
+            return r;
+        most = is_short ? ((const int32_t *)left)[row] : ((const int64_t *)left)[row];
+        row += steps[r] < most ? steps[r] : most;
+        out[r] = row < length ? row : row - length;
+    }
+    return GOOD;
+}
+
 /* HindsightGoal: the goals of rows by their sources, of hindsight_sources, and the goals
  * that the rows achieve, which are some columns of values. */
 int64_t relabel_rows(int64_t rows, int64_t width, int64_t bytes, const int64_t *source,
@@ -239,19 +262,53 @@ int64_t relabel_rows(int64_t rows, int64_t width, int64_t bytes, const int64_t *
     return GOOD;
 }
 
+/* A batch with other goals, from random numbers: hindsight_sources and relabel_rows, and
+ * which rows are relabelled or counterfactual.
+ *
+ * Numbers: rows, width of a goal, bytes of a value, bytes of a row of values, runs; the
+ * addresses of flags, random numbers (chance and pick), desired, future (or 0), values,
+ * starts and lengths of the runs, memory (order and source), goals, achieved, relabeled
+ * and changed. Shares: future, random, counterfactual.
+ */
+int64_t relabel_batch(const int64_t *number, const double *shares)
+{
+    int64_t rows = number[0], *order = (int64_t *)number[12], bad;
+    const uint8_t *flags = (const uint8_t *)number[5];
+    const double *chance = (const double *)number[6];
+    uint8_t *relabeled = (uint8_t *)number[15], *changed = (uint8_t *)number[16];
+    hindsight_sources(rows, flags, chance, chance + rows, shares[0], shares[1], shares[2],
+                      order, order + rows);
+    bad = relabel_rows(rows, number[1], number[2], order + rows, (const char *)number[7],
+                       (const char *)number[8], (const char *)number[9], number[3],
+                       number[4], (const int64_t *)number[10], (const int64_t *)number[11],
+                       (char *)number[13], (char *)number[14], relabeled);
+    for (int64_t r = 0; r < rows; r++)
+        changed[r] = relabeled[r] | flags[r];
+    return bad;
+}
+
 /* draws.uninfluenced: whether the scores of a window are at most the limits, of which
  * there is one for all entities or one for each. */
 int64_t uninfluenced(int64_t windows, int64_t window, int64_t entities,
                      const float *scores, const float *limits, int64_t step,
                      uint8_t *is_free)
 {
-    for (int64_t b = 0; b < windows; b++)
-        for (int64_t n = 0; n < entities; n++) {
-            uint8_t found = 1;
-            for (int64_t w = 0; w < window; w++)
-                found &= scores[(b * window + w) * entities + n] <= limits[n * step];
-            is_free[b * entities + n] = found;
+    int32_t above[TOGETHER];
+    float limit[TOGETHER];
+    for (int64_t begin = 0; begin < entities; begin += TOGETHER) {
+        int64_t some = entities - begin < TOGETHER ? entities - begin : TOGETHER;
+        for (int64_t n = 0; n < some; n++)
+            limit[n] = limits[(begin + n) * step];
+        for (int64_t b = 0; b < windows; b++) {
+            const float *row = scores + b * window * entities + begin;
+            memset(above, 0, sizeof(above));
+            for (int64_t w = 0; w < window; w++, row += entities)
+                for (int64_t n = 0; n < some; n++)
+                    above[n] |= !(row[n] <= limit[n]); /* NaN is influence */
+            for (int64_t n = 0; n < some; n++)
+                is_free[b * entities + begin + n] = !above[n];
         }
+    }
     return GOOD;
 }
 
@@ -269,8 +326,15 @@ static void copy_run(int64_t count, const int64_t *listed, const int64_t *donors
             for (int64_t w = 0; w < window; w++)
                 fetch(later + w * row_bytes, bytes);
         }
-        for (int64_t w = 0; w < window; w++)
-            copy(to + w * row_bytes, from + w * row_bytes, bytes);
+        if (bytes == 4) /* a float, in one instruction */
+            for (int64_t w = 0; w < window; w++)
+                memcpy(to + w * row_bytes, from + w * row_bytes, 4);
+        else if (bytes == 8)
+            for (int64_t w = 0; w < window; w++)
+                memcpy(to + w * row_bytes, from + w * row_bytes, 8);
+        else
+            for (int64_t w = 0; w < window; w++)
+                copy(to + w * row_bytes, from + w * row_bytes, bytes);
     }
 }
 

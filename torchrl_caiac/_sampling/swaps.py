@@ -264,8 +264,9 @@ def _table_row(
     own: torch.Tensor, source: torch.Tensor, runs: Runs, out: torch.Tensor
 ) -> list[int]:
     """Returns what ``swap_rows`` in C knows of a leaf."""
-    tensors = (*runs[:3], own, source, out)
+    entity, begin, length, _ = runs
     return [
-        *(len(source), own.nbytes // len(own), len(runs.entity)),
-        *map(cuda.address, tensors),
+        *(source.shape[0], own.nbytes // own.shape[0], entity.shape[0]),
+        *(entity.data_ptr(), begin.data_ptr(), length.data_ptr()),
+        *(own.data_ptr(), source.data_ptr(), out.data_ptr()),
     ]

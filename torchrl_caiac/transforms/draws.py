@@ -489,8 +489,9 @@ def draw_buffer_donors(
         and is_native_index(index, free.shape[1])
         and _is_native_draw(free, chosen, len(free), index)
     ):
+        windows, entities = free.shape
         chance, share = donor_numbers(
-            *free.t().shape, swap_prob, device=device, generator=generator
+            entities, windows, swap_prob, device=device, generator=generator
         )
         share = share.view(free.shape)
         drawn = buffer_donors(free, *index, swap_prob, chosen, chance, share)

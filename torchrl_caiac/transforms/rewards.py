@@ -255,7 +255,8 @@ class GoalLeaves:
         leaves: dict[NestedKey, torch.Tensor] = {}
         if self._reward is not None:
             stored = stored_reward(td, keys.reward)
-            new = call_reward(self._reward, achieved, desired, stored[first:], action)
+            like = stored[first:] if first else stored
+            new = call_reward(self._reward, achieved, desired, like, action)
             if self.check:
                 self._check_finite(new, achieved, desired, first, where)
             leaves[keys.reward] = _merge(stored, new, first, where)
@@ -286,11 +287,11 @@ class GoalLeaves:
     ) -> None:
         if not reward.is_floating_point():
             return
-        flat = reward.detach().reshape(-1)
-        is_late = LateCheck.needed(flat.device)
+        is_late = LateCheck.needed(reward.device)
         # A sum is finite if all its terms are.
-        if not is_late and math.isfinite(flat.sum().item()):
+        if not is_late and math.isfinite(reward.sum().item()):
             return
+        flat = reward.detach().reshape(-1)
         if not is_late:
             if where is not None:
                 flat = flat.where(where, torch.zeros_like(flat))
@@ -385,10 +386,10 @@ def _merge(
 ) -> torch.Tensor:
     """Returns stored values ``[B, ...]`` with new ones from row ``first`` on."""
     stored = stored.to(new.dtype)
-    tail = stored[first:]
+    tail = stored[first:] if first else stored
     new = new.reshape(tail.shape).to(stored.device)
     if where is not None:
-        new = torch.where(where.reshape(tail.shape), new, tail)
+        new = torch.where(where.view(tail.shape), new, tail)
     return torch.cat([stored[:first], new]) if first else new
 
 

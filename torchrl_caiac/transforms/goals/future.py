@@ -24,7 +24,7 @@ from torchrl_caiac.transforms.checks import check_generator, check_layout
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 
-__all__ = ["FutureGoal", "draw_goal_offset"]
+__all__ = ["FutureGoal", "draw_goal_offset", "draw_steps"]
 
 
 def draw_goal_offset(
@@ -75,7 +75,7 @@ def draw_goal_offset(
             drawn = draw_below(remaining + 1, generator=generator)
         elif name == "geometric":
             drawn = torch.minimum(
-                _geometric(remaining.shape, p, device, generator), remaining
+                draw_steps(remaining.shape, p, device, generator), remaining
             )
         if chance is None or below == 0.0:
             offset = drawn
@@ -85,13 +85,29 @@ def draw_goal_offset(
     return offset
 
 
-def _geometric(
+def draw_steps(
     shape: torch.Size,
     p: float,
     device: torch.device,
-    generator: torch.Generator | None,
+    generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draws the number of failed trials before the first success, int64."""
+    """Draws the number of failed trials before the first success.
+
+    Args:
+        shape (torch.Size): the shape of the result.
+        p (float): the probability of success, above 0.
+        device (torch.device): the device of the result.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        torch.Tensor: int64, of this shape.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.goals.future import draw_steps
+        >>> draw_steps((2,), 1.0, torch.device("cpu"))
+        tensor([0, 0])
+    """
 
     def draw(*, generator: Any, **kwargs: Any) -> torch.Tensor:
         trials = torch.empty(shape, dtype=torch.int64, **kwargs)
@@ -248,14 +264,14 @@ class FutureGoal(RandomTransform, SampleUnit):
 
     # --- reading ---------------------------------------------------------------------
 
-    def flat_source(self, data: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the leaf that a flat layout's goals are read from, and the columns.
+    def flat_source(self, data: TensorDictBase) -> torch.Tensor:
+        """Returns the leaf that a flat layout's goals are read from.
 
         Args:
             data (TensorDictBase): the data, ``[T]``.
 
         Returns:
-            tuple of torch.Tensor: ``[T, D]``, and int64 ``[G]`` on the same device.
+            torch.Tensor: ``[T, D]``.
 
         Raises:
             KeyError: the data lack the leaf.
@@ -276,8 +292,12 @@ class FutureGoal(RandomTransform, SampleUnit):
                 f"but the layout's goals need [T, D] with at least {max(columns) + 1}: "
                 "correct the layout, or the data"
             )
-        where = self.layout.index_tensor(("goal", key), columns, source.device)
-        return plain_tensor(source), where
+        return plain_tensor(source)
+
+    def goal_index(self, device: torch.device) -> torch.Tensor:
+        """Returns :attr:`goal_columns` on a device, int64 ``[G]``."""
+        key, columns = self._goal_columns
+        return self.layout.index_tensor(("goal", key), columns, device)
 
     def nested_source(self, data: TensorDictBase, name: str) -> Any:
         """Returns the leaf or tensordict that an entity's goal is read from.
@@ -321,15 +341,17 @@ class FutureGoal(RandomTransform, SampleUnit):
         """
         layout = self.layout
         if layout.is_flat:
-            source, where = self.flat_source(data)
+            source = self.flat_source(data)
             numbers = source if rows is None else rows
             is_vector = rows is None or (rows.ndim, rows.dtype) == (1, torch.int64)
             if is_vector and is_native(numbers, sources=[source]):
                 goals = read_columns(source, self._goal_columns[1], rows)
             elif rows is None:
+                where = self.goal_index(source.device)
                 goals = source.gather(1, where.expand(source.shape[0], -1))
             else:
                 rows = rows.to(source.device).unsqueeze(-1)
+                where = self.goal_index(source.device)
                 places = torch.add(where, rows, alpha=source.shape[-1])
                 goals = pick_places(source, places.flatten()).view(places.shape)
             return {layout.desired_goal_key: goals}

@@ -11,13 +11,14 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._batches import with_leaves
 from torchrl_caiac._keys import floating
-from torchrl_caiac._random import draw_numbers
+from torchrl_caiac._random import draw_below, draw_numbers
 from torchrl_caiac._sampling import hindsight_sources, is_native, relabel_rows
 from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_number
-from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
+from torchrl_caiac.transforms.goals.future import FutureGoal, draw_steps
+from torchrl_caiac.transforms.goals.repeated_relabel import RepeatedRelabel
 from torchrl_caiac.transforms.indexing import window_starts
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import (
@@ -155,6 +156,12 @@ class HindsightGoal(FutureGoal):
         tensor([-0., -0., -0.])
     """
 
+    _repeated: RepeatedRelabel | None
+
+    def _reset_state(self) -> None:
+        super()._reset_state()
+        self._repeated = None
+
     def __init__(
         self,
         layout: EntityLayout,
@@ -230,13 +237,16 @@ class HindsightGoal(FutureGoal):
         if self.future > 0:
             data, trajectories = self.stored(storage)
             rows = flat_rows(index, storage).to(trajectories.device)
-            offset = draw_goal_offset(
-                trajectories.remaining(rows),
-                {self.strategy: 1.0},
-                p=self.p,
-                generator=self.generator,
-            )
-            self.keep_goals(self.read_goals(data, trajectories.later(rows, offset)))
+            generator = self.generator
+            if self.strategy == "geometric":
+                steps = draw_steps(rows.shape, self.p, rows.device, generator)
+                later = trajectories.ahead(rows, steps)
+            else:
+                steps = draw_below(
+                    trajectories.remaining(rows) + 1, generator=generator
+                )
+                later = trajectories.later(rows, steps)
+            self.keep_goals(self.read_goals(data, later))
         return index, info
 
     def generate_parameters(
@@ -345,7 +355,7 @@ class HindsightGoal(FutureGoal):
         ``None`` if these data need torch.
         """
         key = self.layout.desired_goal_key
-        values, _ = self.flat_source(td)
+        values = self.flat_source(td)
         desired = leaf_of(td, key)
         future = None if draw.future is None else draw.future[key]
         columns = self.goal_columns
@@ -415,6 +425,14 @@ class HindsightGoal(FutureGoal):
         """
         self.warn_if_forked()
         goals = self.take_goals()
+        repeated = self._repeated  # which another thread may replace
+        if repeated is not None and repeated.keys == self.keys:
+            shares = self.future, self.random, self.counterfactual
+            done = repeated(
+                tensordict, goals, shares, self._goal_leaves, self.generator
+            )
+            if done is not None:
+                return done
         shape = tensordict.batch_size
         if len(shape) != 1:
             tensordict = tensordict.reshape(-1)
@@ -447,7 +465,17 @@ class HindsightGoal(FutureGoal):
             flags = torch.zeros(rows, 1, dtype=torch.bool, device=device)
         draw = self.generate_parameters(flags, goals)
         out = self.apply_parameters(tensordict, draw)
+        if self.layout.is_flat:
+            self._repeated = self._repeated_from(tensordict)
         return out if len(shape) == 1 else out.reshape(shape)
+
+    def _repeated_from(self, td: TensorDictBase) -> RepeatedRelabel | None:
+        """Returns what relabels batches like this one, if it can."""
+        key, columns = self.achieved_keys[0], self.goal_columns
+        try:
+            return RepeatedRelabel(td, self.layout, key, columns, self.keys)
+        except TypeError:
+            return None
 
     def her_reward(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Computes the rewards for a :class:`~torchrl.data.HERReplayBuffer`.

@@ -236,7 +236,8 @@ class WindowGoal(FutureGoal):
             torch.Tensor: ``[C, G]``, or ``[C, ...]`` for one entity.
         """
         if isinstance(owner, torch.Tensor):
-            source, where = self.flat_source(donors)
+            source = self.flat_source(donors)
+            where = self.goal_index(source.device)
             rows = rows.gather(1, owner.to(rows.device).expand(rows.shape[0], -1))
             places = rows.to(source.device) * source.shape[-1] + where
             return pick_places(source, places.flatten()).view(places.shape)
