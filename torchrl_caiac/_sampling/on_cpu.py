@@ -73,6 +73,7 @@ _ARGUMENTS: dict[str, list[Any]] = {
     "hindsight_sources": [_I, *[_P] * 3, *[ctypes.c_double] * 3, _P, _P],
     "relabel_batch": [_P, _P],
     "relabel_rows": [*[_I] * 3, *[_P] * 4, _I, _I, *[_P] * 5],
+    "gather_rows": [_I, _I, _P, _I, _P],
     "rows_ahead": [_I, _I, _P, _P, _I, _P, _P],
     "rows_equal": [_I, _I, _P, _I, _P, _P],
     "read_columns": [_I, _I, _P, _I, _I, *[_P] * 4],

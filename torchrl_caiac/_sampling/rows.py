@@ -18,6 +18,7 @@ __all__ = [
     "column_runs",
     "device_numbers",
     "free_windows",
+    "gather_rows",
     "look",
     "read_columns",
     "row_sums",
@@ -99,6 +100,34 @@ def state_matches(
         valid,
     )
     return valid
+
+
+def gather_rows(
+    sources: Sequence[torch.Tensor], rows: torch.Tensor
+) -> list[torch.Tensor]:
+    """Returns rows of several tensors on the CPU.
+
+    Args:
+        sources (sequence of torch.Tensor): ``[T, ...]`` each.
+        rows (torch.Tensor): int64 ``[B]``.
+
+    Returns:
+        list of torch.Tensor: ``[B, ...]`` each.
+
+    Raises:
+        IndexError: a row is out of range.
+    """
+    count, length = rows.shape[0], sources[0].shape[0]
+    table, found = [], []
+    for source in sources:
+        out = source.new_empty((count, *source.shape[1:]))
+        found.append(out)
+        table += [source.data_ptr(), out.data_ptr(), source.nbytes // length]
+    call_with_rows(
+        *("gather_rows", rows, length, count, length, rows),
+        *(len(found), (ctypes.c_int64 * len(table))(*table)),
+    )
+    return found
 
 
 def rows_ahead(

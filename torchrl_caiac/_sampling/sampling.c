@@ -12,6 +12,8 @@
 #define NEXT 0x9E3779B97F4A7C15u /* of _fingerprints */
 #define LINE 64 /* bytes of a cache line */
 #define AHEAD 8 /* rows whose donors are fetched before they are needed */
+#define FAR 32 /* the same of rows that are copied whole */
+#define PAGE 4096 /* bytes of a row that are fetched ahead, at most */
 #define TOGETHER 16 /* entities that are compared at a time */
 #define LISTED 512 /* windows whose swaps are listed at a time */
 
@@ -220,6 +222,27 @@ int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
         for (int64_t i = 0; i < runs; i++) {
             copy(out, from + run_start[i], run_bytes[i]);
             out += run_bytes[i];
+        }
+    }
+    return GOOD;
+}
+
+/* The rows of all leaves at some places. A leaf has three numbers in the table: the
+ * addresses of its source and of out, and its bytes a row. */
+int64_t gather_rows(int64_t count, int64_t length, const int64_t *places, int64_t leaves,
+                    const int64_t *table)
+{
+    for (int64_t r = 0; r < count; r++)
+        if (places[r] < 0 || places[r] >= length)
+            return r;
+    for (; leaves > 0; leaves--, table += 3) {
+        const char *source = (const char *)table[0];
+        char *out = (char *)table[1];
+        int64_t bytes = table[2];
+        for (int64_t r = 0; r < count; r++, out += bytes) {
+            if (r + FAR < count)
+                fetch(source + places[r + FAR] * bytes, bytes < PAGE ? bytes : PAGE);
+            copy(out, source + places[r] * bytes, bytes);
         }
     }
     return GOOD;
