@@ -79,7 +79,7 @@ def make_buffer(
     goals = WindowGoal(layout, window)
     rb = ReplayBuffer(
         storage=offline_storage(data.to(device)),
-        sampler=SliceSampler(slice_len=window, traj_key="episode", cache_values=True),
+        sampler=slices(window),
         sample_unit=goals,
         batch_size=windows * window,
     )
@@ -87,6 +87,13 @@ def make_buffer(
     if swap:
         rb.append_transform(CAIACTransform(layout, threshold=0.3, window=window))
     return rb
+
+
+def slices(window: int) -> SliceSampler:
+    """The sampler of the examples, which writes no end flags into windows."""
+    return SliceSampler(
+        slice_len=window, traj_key="episode", cache_values=True, truncated_key=None
+    )
 
 
 def make_loss(window: int, device: torch.device) -> LMPLoss:

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 import torch
-from torchrl.data import ReplayBuffer, SliceSampler
+from torchrl.data import ReplayBuffer
 
-from benchmarks.bench_lmp import SIZES, make_buffer, make_step
+from benchmarks.bench_lmp import SIZES, make_buffer, make_step, slices
 from benchmarks.bench_sampling import TRANSITIONS, Setting, made
 from benchmarks.bench_td3 import DTYPE, Learner
 from benchmarks.ratios import seconds
@@ -81,7 +81,7 @@ def bench_lmp_share(
     buffer = make_buffer(windows, window, device, swap=True)
     plain = ReplayBuffer(
         storage=buffer.storage,
-        sampler=SliceSampler(slice_len=window, traj_key="episode", cache_values=True),
+        sampler=slices(window),
         batch_size=windows * window,
     )
     step, batch = make_step(window, device), buffer.sample()

@@ -316,6 +316,35 @@ def test_rows_of_are_those_of_an_index(kind):
     assert found["next"].batch_size == wanted["next"].batch_size
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("mapped", [False, True])
+def test_rows_of_all_kinds_of_leaves(mapped, threads, tmp_path):
+    td = TensorDict({"wide": torch.rand(50, 3000), "none": torch.zeros(50, 0)}, [50])
+    for number, dtype in enumerate(
+        [torch.bool, torch.int16, torch.bfloat16, torch.complex64, torch.float64]
+    ):
+        td[f"{number}"] = torch.randint(2, (50, number + 1, 3)).to(dtype)
+    td["flag"] = torch.rand(50) < 0.5
+    td["strided"] = torch.rand(7, 50).t()
+    td = td.memmap(tmp_path) if mapped else td
+    picked = torch.randint(50, (90,))
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        for some in (td, td.exclude("none"), td.exclude("none", "strided")):
+            wanted, found = some[picked], rows_of(some, picked)
+            assert set(found.keys()) == set(wanted.keys())
+            for key, leaf in wanted.items():
+                assert type(found[key]) is torch.Tensor
+                assert found[key].dtype == leaf.dtype and torch.equal(found[key], leaf)
+            assert rows_of(some, picked[:0]).batch_size == (0,)
+            for bad in (-1, 50, 2**40):
+                with pytest.raises(IndexError):
+                    rows_of(some, torch.tensor([3, bad]))
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_prefetched_batches_are_dropped(rb):
     rb.sample()  # samples the next ones ahead
     fence.storage_data(rb.storage)["a"].fill_(9)

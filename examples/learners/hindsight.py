@@ -13,32 +13,17 @@ from torchrl.data.replay_buffers import RandomSampler, Storage
 from learners.goal_conditioned import GoalConditioned
 from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.trajectories import trajectory_index
-from torchrl_caiac.transforms import HindsightGoal
-from torchrl_caiac.transforms.goals.hindsight import HindsightDraw
+from torchrl_caiac.transforms import HindsightGoal, TransformKeys
 
 __all__ = [
     "UNEXPLAINED",
     "HindsightLearner",
-    "MarkedHindsightGoal",
     "ShareSampler",
     "until_success",
 ]
 
 #: True where the goal is one that another row achieves, bool ``[B, 1]``.
 UNEXPLAINED: NestedKey = ("hindsight", "unexplained")
-
-
-class MarkedHindsightGoal(HindsightGoal):
-    """Marks the rows whose action does not explain their goal."""
-
-    def apply_parameters(
-        self, tensordict: TensorDictBase, draw: HindsightDraw
-    ) -> TensorDictBase:
-        """Relabels a batch; goals of other rows are marked."""
-        out = super().apply_parameters(tensordict, draw)
-        rows = len(tensordict)
-        other = (draw.source >= rows) & (draw.source < 2 * rows)
-        return out.set(UNEXPLAINED, other.unsqueeze(-1))
 
 
 def until_success(rows: TensorDictBase) -> torch.Tensor:
@@ -137,11 +122,12 @@ class HindsightLearner(GoalConditioned):
         augmentation = self.counterfactuals()
         ratio = self.augmentation.counterfactual_ratio
         random = 0.5 if self.settings.get("random_goals", True) else 0.0
-        goals = MarkedHindsightGoal(
+        goals = HindsightGoal(
             environment.layout,
             environment.reward_fn,
             random=random * ratio if augmentation is None else 0.0,
             counterfactual=random,
+            keys=TransformKeys(unexplained=UNEXPLAINED),
             **self.augmentation.get("hindsight", {}),
         )
         options: dict[str, Any] = {}

@@ -58,7 +58,10 @@ def imitation_buffer(
     options: dict[str, Any] = {}
     if window > 1:
         options["sampler"] = SliceSampler(
-            slice_len=window, traj_key="episode", cache_values=True
+            slice_len=window,
+            traj_key="episode",
+            cache_values=True,
+            truncated_key=None,  # no learner here reads the ends of windows
         )
     if goals is not None:
         options["sample_unit"] = goals

@@ -118,12 +118,15 @@ class RelabeledBatch(NamedTuple):
             bool ``[B, 1]``.
         changed (torch.Tensor): which rows are relabelled or counterfactual, bool
             ``[B]``.
+        source (torch.Tensor): where each goal comes from, int64 ``[B]``, as of
+            :func:`hindsight_sources`.
     """
 
     goals: torch.Tensor
     achieved: torch.Tensor
     relabeled: torch.Tensor
     changed: torch.Tensor
+    source: torch.Tensor
 
 
 def relabel_batch(
@@ -156,7 +159,7 @@ def relabel_batch(
         chance, pick = numbers.unbind()
         source = hindsight_sources(flags, chance, pick, *shares)
         found = relabel_rows(desired, values, columns, future, source)
-        return RelabeledBatch(*found, found[2].view(-1) | flags)
+        return RelabeledBatch(*found, found[2].view(-1) | flags, source)
     rows, width = desired.shape
     goals, achieved = torch.empty_like(desired), torch.empty_like(desired)
     memory = numbers.new_empty(2, rows, dtype=torch.int64)
@@ -171,4 +174,4 @@ def relabel_batch(
     ]
     given = (ctypes.c_int64 * len(table))(*table)
     call("relabel_batch", given, (ctypes.c_double * 3)(*shares))
-    return RelabeledBatch(goals, achieved, relabeled, changed)
+    return RelabeledBatch(goals, achieved, relabeled, changed, memory[1])

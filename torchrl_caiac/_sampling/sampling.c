@@ -373,15 +373,23 @@ int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities
                   const int64_t *table)
 {
     int64_t listed[LISTED], length = leaves ? table[0] : 0;
+    /* So few windows at a time that their rows stay in the cache. */
+    int64_t most = window < LISTED ? LISTED / window : 1;
     for (int64_t l = 0; l < leaves; l++) {
         const int64_t *leaf = table + 9 * l;
         length = leaf[0] < length ? leaf[0] : length;
-        memcpy((char *)leaf[8], (const char *)leaf[6],
-               (size_t)((first + drawn * window) * leaf[1]));
+        memcpy((char *)leaf[8], (const char *)leaf[6], (size_t)(first * leaf[1]));
     }
-    for (int64_t begin = 0; begin < drawn; begin += LISTED)
+    for (int64_t begin = 0; begin < drawn; begin += most) {
+        int64_t end = begin + most < drawn ? begin + most : drawn;
+        for (int64_t l = 0; l < leaves; l++) {
+            const int64_t *leaf = table + 9 * l;
+            int64_t start = (first + begin * window) * leaf[1];
+            memcpy((char *)leaf[8] + start, (const char *)leaf[6] + start,
+                   (size_t)((end - begin) * window * leaf[1]));
+        }
         for (int64_t n = 0; n < entities; n++) {
-            int64_t end = begin + LISTED < drawn ? begin + LISTED : drawn, count = 0;
+            int64_t count = 0;
             for (int64_t c = begin; c < end; c++) {
                 listed[count] = c;
                 count += swapped[c * entities + n];
@@ -404,6 +412,7 @@ int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities
                                  (char *)leaf[8] + first * leaf[1] + start[i]);
             }
         }
+    }
     return GOOD;
 }
 

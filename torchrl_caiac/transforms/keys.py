@@ -42,6 +42,11 @@ class TransformKeys:
             :class:`~torchrl_caiac.transforms.WindowGoal` writes. Swaps and later
             relabelling change goals, not this leaf. Defaults to
             ``("hindsight", "steps")``.
+        unexplained (NestedKey, optional): the flag of transitions whose goal another
+            transition achieves, so that their own action need not lead to it, bool
+            ``[*B, 1]``, which :class:`~torchrl_caiac.transforms.HindsightGoal` writes.
+            Learners that repeat actions leave these out. Defaults to ``None``: it is
+            not written.
 
     Raises:
         TypeError: a key is not a ``str`` or a tuple of them.
@@ -63,10 +68,11 @@ class TransformKeys:
     terminated: NestedKey = ("next", "terminated")
     truncated: NestedKey = ("next", "truncated")
     goal_steps: NestedKey = ("hindsight", "steps")
+    unexplained: NestedKey | None = None
 
     def __post_init__(self) -> None:
         for field in fields(self):
             key = getattr(self, field.name)
-            if key is None and field.name in ("trajectory", "done"):
+            if key is None and field.name in ("trajectory", "done", "unexplained"):
                 continue
             object.__setattr__(self, field.name, as_key(key))

@@ -118,6 +118,7 @@ def pair(td: TensorDict, **kwargs: Any) -> tuple[HindsightGoal, HindsightGoal]:
         }
     ),
     ends=st.booleans(),
+    unexplained=st.sampled_from([None, ("hindsight", "unexplained"), "other"]),
     seed=st.integers(0, 99),
 )
 @pytest.mark.filterwarnings("ignore:.*terminated.*is true in some")
@@ -130,6 +131,7 @@ def test_the_same_as_step_by_step(
     counterfactual: float,
     form: dict[str, Any],
     ends: bool,
+    unexplained: Any,
     seed: int,
 ) -> None:
     def reached(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
@@ -142,6 +144,7 @@ def test_the_same_as_step_by_step(
         random=min(random, 1.0 - future),
         counterfactual=counterfactual,
         terminated_fn=reached if ends else None,
+        keys=TransformKeys(unexplained=unexplained),
     )
     td = batch(rows, seed + 1, **form).to(device)
     before = td.clone()
@@ -168,6 +171,29 @@ def test_settings_that_change() -> None:
     out, is_repeated = relabelled(goals, td)
     assert not is_repeated and out["other"].shape == (30, 1)
     assert relabelled(goals, td)[1]
+
+
+def test_methods_of_a_subclass_are_called() -> None:
+    class Marked(HindsightGoal):
+        def apply_parameters(self, tensordict: Any, draw: Any) -> Any:
+            return super().apply_parameters(tensordict, draw).set("source", draw.source)
+
+    goals = Marked(LAYOUT, reward, future=0.0, counterfactual=1.0)
+    for _ in range(2):
+        out, is_repeated = relabelled(goals, batch())
+        assert not is_repeated and out["source"].shape == (30,)
+
+
+def test_goals_of_other_rows_are_marked() -> None:
+    td, keys = batch(), TransformKeys(unexplained="other")
+    goals, fresh = pair(td, future=0.5, random=0.3, counterfactual=0.5, keys=keys)
+    assert "other" in goals.out_keys
+    for some in (goals, fresh):
+        out, _ = relabelled(some, td)
+        reached = out["next", "observation"][:, [2, 1, 3]]
+        is_other = (out["desired_goal"][:, None] == reached).all(-1).any(1)
+        assert torch.equal(out["other"][:, 0], is_other) and is_other.any()
+        assert not is_other.all()
 
 
 # Buffers send their transforms to other processes pickled; nothing is read from a file.

@@ -18,7 +18,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_number
 from torchrl_caiac.transforms.goals.future import FutureGoal, draw_steps
-from torchrl_caiac.transforms.goals.repeated_relabel import RepeatedRelabel
+from torchrl_caiac.transforms.goals.repeated_relabel import RepeatedRelabel, unexplained
 from torchrl_caiac.transforms.indexing import window_starts
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import (
@@ -204,6 +204,8 @@ class HindsightGoal(FutureGoal):
             *self._goal_leaves.out_keys,
             self.keys.relabeled,
         ]
+        if self.keys.unexplained is not None:
+            self.out_keys.append(self.keys.unexplained)
 
     @property
     def reward_fn(self) -> RewardFn | None:
@@ -339,6 +341,8 @@ class HindsightGoal(FutureGoal):
             goals[self.layout.desired_goal_key] = desired
         is_new = relabeled if flags is None else relabeled | flags
         leaves = self._goal_leaves(td, reached, desired, where=is_new.reshape(-1))
+        if self.keys.unexplained is not None:
+            leaves[self.keys.unexplained] = unexplained(draw.source)
         after = {self.layout.next(key): goal for key, goal in goals.items()}
         return {
             **goals,
@@ -465,12 +469,18 @@ class HindsightGoal(FutureGoal):
             flags = torch.zeros(rows, 1, dtype=torch.bool, device=device)
         draw = self.generate_parameters(flags, goals)
         out = self.apply_parameters(tensordict, draw)
-        if self.layout.is_flat:
-            self._repeated = self._repeated_from(tensordict)
+        self._repeated = self._repeated_from(tensordict)
         return out if len(shape) == 1 else out.reshape(shape)
 
     def _repeated_from(self, td: TensorDictBase) -> RepeatedRelabel | None:
         """Returns what relabels batches like this one, if it can."""
+        own, base = type(self), HindsightGoal
+        if (
+            not self.layout.is_flat
+            or own.generate_parameters is not base.generate_parameters
+            or own.apply_parameters is not base.apply_parameters
+        ):
+            return None
         key, columns = self.achieved_keys[0], self.goal_columns
         try:
             return RepeatedRelabel(td, self.layout, key, columns, self.keys)

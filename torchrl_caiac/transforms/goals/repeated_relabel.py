@@ -16,7 +16,27 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.keys import TransformKeys
 from torchrl_caiac.transforms.rewards import GoalLeaves
 
-__all__ = ["RepeatedRelabel"]
+__all__ = ["RepeatedRelabel", "unexplained"]
+
+
+def unexplained(source: torch.Tensor) -> torch.Tensor:
+    """Returns which rows have goals that other rows achieve.
+
+    Args:
+        source (torch.Tensor): int64 ``[B]``, see
+            :class:`~torchrl_caiac.transforms.goals.hindsight.HindsightDraw`.
+
+    Returns:
+        torch.Tensor: bool ``[B, 1]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.goals.repeated_relabel import unexplained
+        >>> unexplained(torch.tensor([0, 3, 7])).flatten()
+        tensor([False,  True, False])
+    """
+    rows = source.shape[0]
+    return ((source >= rows) & (source < 2 * rows)).unsqueeze(-1)
 
 
 class RepeatedRelabel:
@@ -127,4 +147,6 @@ class RepeatedRelabel:
         found = dict.fromkeys(self._written, new.goals)
         found |= goal_leaves(td, new.achieved, new.goals, where=new.changed)
         found[self.keys.relabeled] = new.relabeled
+        if self.keys.unexplained is not None:
+            found[self.keys.unexplained] = unexplained(new.source)
         return self._batch.copy(td, found)
