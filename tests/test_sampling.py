@@ -162,6 +162,45 @@ def test_swapped_rows(
 
 
 @DEVICES
+@pytest.mark.parametrize("other", [False, True])
+@pytest.mark.parametrize(
+    ("windows", "window", "dtype"),
+    [(1300, 1, torch.float32), (70, 20, torch.float16), (3, 600, torch.uint8)],
+)
+def test_rows_of_large_batches(
+    device: str, windows: int, window: int, dtype: torch.dtype, other: bool
+) -> None:
+    # Entities of 1 to 300 values, more of them than are compared at a time.
+    widths, of = [*range(1, 18), 100, 300], torch.Generator().manual_seed(0)
+    ends = torch.tensor(widths).cumsum(0).tolist()
+    layout = EntityLayout(
+        {
+            f"{i}": range(end - width, end)
+            for i, (width, end) in enumerate(zip(widths, ends, strict=True))
+        }
+    )
+
+    def values(rows: int) -> torch.Tensor:
+        return torch.randint(0, 200, (rows, ends[-1]), generator=of).to(device, dtype)
+
+    rows, drawn = windows * window, windows - 1
+    td = TensorDict({"observation": values(rows)}, [rows])
+    td["next", "observation"] = values(rows)
+    shape = drawn, len(widths)
+    starts = torch.randint(0, rows - window + 1, shape, generator=of)
+    swapped = torch.rand(shape, generator=of) < 0.5
+    draw = SwapDraw(starts.to(device), swapped.to(device), torch.zeros(19).long())
+    planner = SwapPlanner(layout)
+    sources = [values(rows) for _ in range(2)] if other else None
+    in_c, in_torch = both(
+        lambda: apply_swap(td, *planner(td), draw, window=window, sources=sources),
+        device,
+    )
+    for key in ("observation", ("next", "observation")):
+        assert bits(in_c[key]) == bits(in_torch[key])
+
+
+@DEVICES
 @settings(max_examples=100, deadline=None)
 @given(
     shape=st.tuples(st.integers(1, 8), st.integers(1, 3)),
@@ -586,18 +625,27 @@ def test_goals_of_rows(
     window=st.integers(1, 4),
     threshold=st.sampled_from([0.0, 0.05, 1e300, math.inf]),
     each=st.booleans(),
+    entities=st.sampled_from([3, 16, 37]),
     seed=st.integers(0, 1000),
 )
 def test_uninfluenced_entities(
-    device: str, windows: int, window: int, threshold: float, each: bool, seed: int
+    device: str,
+    windows: int,
+    window: int,
+    threshold: float,
+    each: bool,
+    entities: int,
+    seed: int,
 ) -> None:
     of = torch.Generator().manual_seed(seed)
-    scores = torch.rand(windows * window, 3, generator=of)
+    scores = torch.rand(windows * window, entities, generator=of)
     scores[scores > 0.7] = 0.05
     scores[scores > 0.6] = math.nan
     limit: float | torch.Tensor = threshold
     if each:
-        limit = torch.tensor([threshold, math.nan, 0.3]).to(device)
+        limit = (
+            torch.tensor([threshold, math.nan, 0.3]).repeat(13)[:entities].to(device)
+        )
     scores = scores.to(device)
     assert torch.equal(*both(lambda: uninfluenced(scores, limit, window), device))
 

@@ -299,6 +299,7 @@ def test_with_leaves_is_a_copy_with_leaves(kind, device):
     assert set(out.keys(True, True)) == set(wanted.keys(True, True))
     assert (out == wanted).all() and (td == before).all()
     assert type(out) is type(wanted) and out.names == wanted.names
+    assert out["new"].names == wanted["new"].names
     assert out.device == wanted.device and not out.is_locked
     assert all(out.get(key) is leaves[key] for key in keys if kind == "plain")
     with pytest.raises(RuntimeError, match="batch dimension"):

@@ -21,7 +21,8 @@ from torchrl_caiac._torchrl import entries_of, names_of, tensordict_of
 
 __all__ = ["KnownBatch", "rows_of", "with_leaves"]
 
-_MOST_GATHERED = 1 << 17  # numbers of a leaf that one thread reads
+# Values of a leaf above which torch's threads are faster.
+_MOST_GATHERED = 1 << 17
 
 
 def with_leaves(
@@ -53,7 +54,7 @@ def with_leaves(
         node, entries = out, entries_of(out)
         for parent in parents:
             if entries is not None and parent not in entries:
-                entries[parent] = tensordict_of({}, shape, device)
+                entries[parent] = tensordict_of({}, shape, device, names_of(out))
             node = None if entries is None else entries[parent]
             entries = entries_of(node)
         if (
@@ -115,8 +116,8 @@ class KnownBatch:
     def leaves(self, td: Any) -> list[Tensor] | None:
         """Returns the leaves of a batch, ``None`` if it has another structure.
 
-        That is another batch size or device, other entries, or one of the leaves has
-        another shape, dtype, device or class.
+        That is another batch size or device, other entries or entries of other classes,
+        or one of the leaves has another shape, dtype or device.
 
         Args:
             td (TensorDictBase): the batch.
@@ -208,7 +209,7 @@ def rows_of(td: Any, rows: Tensor) -> Any:
 
 
 def _list_tensors(td: Any, found: list[Tensor]) -> None:
-    """Lists the tensors of a tensordict that are read by themselves."""
+    """Lists the tensors of a tensordict that :func:`_picked` takes from ``found``."""
     if type(td) in (Tensor, MemoryMappedTensor):
         found.append(td.as_subclass(Tensor))
         return
@@ -218,13 +219,16 @@ def _list_tensors(td: Any, found: list[Tensor]) -> None:
 
 def _is_gathered(sources: Sequence[Tensor], rows: Tensor) -> bool:
     """Returns whether rows are read in C."""
-    if not sources or not rows.numel() or not is_native(rows, sources=sources):
+    kind = rows.ndim, rows.dtype, rows.device.type
+    if kind != (1, torch.int64, "cpu") or not is_native(rows, sources=sources):
         return False
-    length = sources[0].shape[0]
+    length = sources[0].shape[0] if sources else 0
+    if not length:
+        return False
     has_threads = torch.get_num_threads() > 1
     for source in sources:
         size = source.numel()
-        if source.shape[0] != length or not size:
+        if source.shape[0] != length:
             return False
         # Of many numbers each thread of torch reads a part.
         if has_threads and size // length * rows.shape[0] > _MOST_GATHERED:

@@ -23,6 +23,7 @@ from torchrl_caiac._torchrl import leaf_of
 __all__ = [
     "fingerprint",
     "fingerprint_key",
+    "hashed_leaves",
     "is_fingerprint_of",
     "leaf_weights",
     "matches",
@@ -201,7 +202,8 @@ def hashed_leaves(
 
     Returns:
         list of tuple, optional: float32 ``[T, L]`` and int64 ``[L]`` each; ``None`` if
-        they are of other kinds, fewer than needed, or more than the functions read.
+        there is none, one of them is not float32 ``[T, L]`` or has fewer rows than
+        needed, or there are more than the functions read.
     """
     found = []
     for entries, factor in ((keys, 1), (next_keys, _NEXT)):

@@ -130,6 +130,7 @@ class TrajectoryIndex(NamedTuple):
             self.order is None
             and rows.dtype is steps.dtype is torch.int64
             and rows.shape == steps.shape
+            and rows.ndim == 1
             and rows.device.type == "cpu"
             and is_native(rows, steps, sources=[self.left])
         ):

@@ -6,6 +6,7 @@ import copy
 import math
 import pickle
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -15,8 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import NonTensorData, NonTensorStack, TensorDict, TensorDictBase
 from torchrl.data import (
+    LazyMemmapStorage,
     LazyTensorStorage,
     ReplayBuffer,
+    SamplerWithoutReplacement,
     SliceSampler,
     TensorStorage,
 )
@@ -27,6 +30,7 @@ from torchrl_caiac._fingerprints import fingerprint, fingerprint_key, state_hash
 from torchrl_caiac._sampling import only_torch
 from torchrl_caiac._torchrl import storage_data
 from torchrl_caiac.transforms import TransformKeys, WindowGoal
+from torchrl_caiac.transforms.donors import BufferDonors
 from torchrl_caiac.transforms.repeated_swap import RepeatedSwap
 
 FLAT = EntityLayout(
@@ -245,9 +249,11 @@ def test_more_windows_than_there_are(rows: Any, ratio: float) -> None:
             some(td)
 
 
-def pair(td: TensorDict, **kwargs: Any) -> tuple[CAIACTransform, CAIACTransform]:
+def pair(
+    td: TensorDict, kind: Any = CAIACTransform, **kwargs: Any
+) -> tuple[CAIACTransform, CAIACTransform]:
     """A transform that repeats swaps, and a fresh one that draws the same numbers."""
-    transform = CAIACTransform(FLAT, 0.5, generator=torch.Generator(), **kwargs)
+    transform = kind(FLAT, 0.5, generator=torch.Generator(), **kwargs)
     fresh = copy.deepcopy(transform)
     repeated(transform, td)
     transform.generator.set_state(fresh.generator.get_state())
@@ -275,13 +281,14 @@ def test_donors_that_are_written_to_are_taken_back(row: int) -> None:
     assert out["caiac", "swapped"].any()
 
 
-@pytest.mark.parametrize("case", ["bits", "ring", "goals", "double"])
+@pytest.mark.parametrize("case", ["bits", "ring", "goals", "subclass"])
 def test_donors_that_are_read_step_by_step(
     case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     td, data, more = batch(FLAT, 100, 2), batch(FLAT, 30, 2, seed=1), {}
     storage = LazyTensorStorage(60)
     storage.set(range(60), data)
+    kind = CAIACTransform
     if case == "bits":
         monkeypatch.setattr("torchrl_caiac.transforms.donors._MOST_LISTED", 0)
     elif case == "ring":
@@ -291,18 +298,68 @@ def test_donors_that_are_read_step_by_step(
     elif case == "goals":
         more = {"goals": WindowGoal(FLAT, window=2)}
     else:
-        for key in ("observation", "desired_goal"):
-            td[key] = td[key].double()
-        td["next", "observation"] = td["next", "observation"].double()
-        del td[fingerprint_key(SCORE)]
-        transform = CAIACTransform(FLAT, 0.5, window=2, donors=storage)
-        with pytest.raises(ValueError, match="donors need the same layout"):
-            transform(td)
-        return
-    transform, fresh = pair(td, window=2, donors=storage, **more)
+
+        class Donors(BufferDonors):
+            """Donors of a subclass, whose methods are called."""
+
+        class Transform(CAIACTransform):
+            donors_class = Donors
+
+        kind = Transform
+    transform, fresh = pair(td, kind, window=2, donors=storage, **more)
     out, is_repeated = taken(transform, td)
     assert not is_repeated and out["caiac", "swapped"].any()
     assert_same(out, fresh(td))
+
+
+@pytest.mark.parametrize("lookahead", [None, 1])
+def test_donors_of_a_buffer_that_grows(lookahead: int | None, tmp_path: Path) -> None:
+    td = batch(FLAT, 100, 2)
+    rb = ReplayBuffer(storage=LazyMemmapStorage(80, scratch_dir=tmp_path))
+    rb.extend(batch(FLAT, 15, 2, seed=1))
+    kwargs = {"window": 2, "donors": rb, "lookahead": lookahead}
+    if lookahead is not None:
+        source = ReplayBuffer(
+            storage=TensorStorage(td),
+            sampler=SamplerWithoutReplacement(shuffle=False),
+            batch_size=200,
+        )
+    transform = CAIACTransform(FLAT, 0.5, generator=torch.Generator(), **kwargs)
+    if lookahead is not None:
+        source.append_transform(transform)
+
+    def swap() -> TensorDictBase:
+        return transform(td) if lookahead is None else source.sample()
+
+    for _ in range(24):
+        swap()
+    rb.extend(batch(FLAT, 15, 2, seed=2))
+    for change in ("grown", "unchecked", "refreshed"):
+        transform.check = change != "unchecked"
+        if change == "refreshed":
+            transform.refresh_donors()
+        swap()
+        transform.generator.manual_seed(3)
+        out, is_repeated = taken(swap)
+        assert is_repeated
+        transform.generator.manual_seed(3)
+        with only_torch():
+            wanted, is_repeated = taken(swap)
+        assert not is_repeated
+        assert_same(out, wanted)
+    new = rb.storage[30:]["observation"][:, 1]  # the cup
+    assert torch.isin(out["observation"][:, 1], new).any()
+
+
+def test_donors_are_not_read_where_nothing_is_swapped() -> None:
+    td, data = batch(FLAT, 100, 1), batch(FLAT, 30, 1, seed=1)
+    del data["desired_goal"]
+    transform = CAIACTransform(FLAT, 0.5, 0.0, donors=TensorStorage(data))
+    for _ in range(24):
+        transform(td)
+    transform.counterfactual_ratio = 0.5
+    with pytest.raises(KeyError, match="donor buffer has no 'desired_goal'"):
+        transform(td)
 
 
 def test_another_default_device() -> None:

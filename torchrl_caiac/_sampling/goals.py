@@ -76,8 +76,8 @@ def relabel_rows(
         values (torch.Tensor): what goals are achieved in, ``[B, D]``.
         columns (sequence of int): its columns that are the achieved goals, ``G``.
         future (torch.Tensor, optional): future goals, ``[B, G]``.
-        source (torch.Tensor): the row of the three together that each goal is, int64
-            ``[B]``.
+        source (torch.Tensor): the row that each goal is of desired, achieved and
+            future goals concatenated, int64 ``[B]``.
 
     Returns:
         tuple of torch.Tensor: the goals and the achieved goals, ``[B, G]``, and which
@@ -153,6 +153,9 @@ def relabel_batch(
 
     Returns:
         RelabeledBatch: the goals.
+
+    Raises:
+        IndexError: a goal comes from the future, and there are no future goals.
     """
     if flags.is_cuda:
         flags = flags.view(-1)
@@ -173,5 +176,8 @@ def relabel_batch(
         *map(cuda.address, (goals, achieved, relabeled, changed)),
     ]
     given = (ctypes.c_int64 * len(table))(*table)
-    call("relabel_batch", given, (ctypes.c_double * 3)(*shares))
+    call_with_rows(
+        *("relabel_batch", memory[1], (2 if future is None else 3) * rows),
+        *(given, (ctypes.c_double * 3)(*shares)),
+    )
     return RelabeledBatch(goals, achieved, relabeled, changed, memory[1])

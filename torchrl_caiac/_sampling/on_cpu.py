@@ -81,7 +81,7 @@ _ARGUMENTS: dict[str, list[Any]] = {
     "all_finite": [_I, _P],
     "uninfluenced": [_I, _I, _I, _P, _P, _I, _P],
     "batch_fits": [_P],
-    "swap_batch": [_P, ctypes.c_float],
+    "swap_batch": [_P, ctypes.c_float, _P],
 }
 
 

@@ -142,6 +142,9 @@ def rows_ahead(
 
     Returns:
         torch.Tensor: int64 ``[B]``.
+
+    Raises:
+        IndexError: a row is out of range, or its steps are negative.
     """
     found = torch.empty_like(rows)
     count, length = rows.shape[0], left.shape[0]

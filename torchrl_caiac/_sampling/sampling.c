@@ -11,20 +11,20 @@
 #define NOT_FINITE -2
 #define NEXT 0x9E3779B97F4A7C15u /* of _fingerprints */
 #define LINE 64 /* bytes of a cache line */
-#define AHEAD 8 /* rows whose donors are fetched before they are needed */
-#define FAR 32 /* the same of rows that are copied whole */
-#define PAGE 4096 /* bytes of a row that are fetched ahead, at most */
+#define AHEAD 8 /* how many rows before it is copied a donor is prefetched */
+#define FAR 32 /* the same for rows that are copied whole */
+#define MOST_FETCHED 4096 /* bytes of a row that are prefetched, at most */
 #define TOGETHER 16 /* entities that are compared at a time */
-#define LISTED 512 /* windows whose swaps are listed at a time */
+#define LISTED 512 /* rows whose swaps are listed at a time */
 
-/* Fetches memory that is needed soon. */
+/* Prefetches memory that is needed soon. */
 static void fetch(const char *from, int64_t bytes)
 {
     for (int64_t i = 0; i < bytes; i += LINE)
         __builtin_prefetch(from + i);
 }
 
-/* Copies bytes; a few of them without the call of a function. */
+/* Copies bytes; a few of them without a function call. */
 static inline void copy(char *to, const char *from, int64_t bytes)
 {
     if (bytes > 256) {
@@ -129,16 +129,16 @@ int64_t batch_donors(int64_t count, int64_t first, int64_t entities, int64_t win
             if (is_free[b * entities + n])
                 listed[total++] = b * window;
         for (int64_t b = 0; b < first; b++)
-            rank += is_free[b * entities + n];
+            rank += is_free[b * entities + n] != 0;
         for (int64_t c = 0; c < drawn; c++) {
             int64_t here = c * entities + n, place;
-            uint8_t is_chosen = is_free[(first + c) * entities + n];
+            uint8_t is_chosen = is_free[(first + c) * entities + n] != 0;
             rank += is_chosen;
             place = (int64_t)(share[n * drawn + c] * (double)(total - 1)) + 1;
             place += place >= rank; /* not the window itself */
             donors[here] = place <= total ? listed[place - 1] : 0;
             if (chosen)
-                is_chosen &= chosen[c];
+                is_chosen &= chosen[c] != 0;
             if (chance)
                 is_chosen &= chance[n * drawn + c] < swap_prob;
             swapped[here] = is_chosen & (total > 1);
@@ -161,12 +161,12 @@ int64_t buffer_donors(int64_t drawn, int64_t entities, const uint8_t *is_free,
         for (int64_t n = 0; n < entities; n++) {
             int64_t here = c * entities + n;
             int64_t place = (int64_t)(share[here] * (double)size[n]) + offset[n];
-            uint8_t is_chosen = is_free[here];
+            uint8_t is_chosen = is_free[here] != 0;
             place = place < 0 ? 0 : place >= length ? length - 1 : place;
             donors[here] = is_short ? ((const int32_t *)starts)[place]
                                     : ((const int64_t *)starts)[place];
             if (chosen)
-                is_chosen &= chosen[c];
+                is_chosen &= chosen[c] != 0;
             if (chance)
                 is_chosen &= chance[n * drawn + c] < swap_prob;
             swapped[here] = is_chosen & (size[n] > 0);
@@ -182,23 +182,23 @@ int64_t hindsight_sources(int64_t rows, const uint8_t *flags, const double *chan
 {
     int64_t size = 0, flagged = 0, last;
     for (int64_t r = 0; r < rows; r++)
-        size += flags[r];
+        size += flags[r] != 0;
     last = size;
     for (int64_t r = 0; r < rows; r++) { /* counterfactual rows first */
-        int64_t end[2] = {last, flagged};
-        order[end[flags[r]]] = r;
-        flagged += flags[r];
-        last += !flags[r];
+        int64_t flag = flags[r] != 0, end[2] = {last, flagged};
+        order[end[flag]] = r;
+        flagged += flag;
+        last += !flag;
     }
     /* Of real rows and of counterfactual ones: the share that is relabelled, and where
-     * in the order the rows are that they draw among. Read from arrays, so that the
-     * processor need not guess what a row is. */
+     * in the order the rows are that they draw among. Arrays instead of branches, which
+     * the processor would mispredict. */
     const double share[2] = {future + random, counterfactual};
     const int64_t among[2] = {random > 0 ? rows - size : size, size};
     const int64_t from[2] = {random > 0 ? size : 0, 0};
     const double later = random > 0 ? future : future > 0 ? 2.0 : 0.0;
     for (int64_t r = 0; r < rows; r++) {
-        int64_t flag = flags[r];
+        int64_t flag = flags[r] != 0;
         int64_t place = (int64_t)(pick[r] * (double)among[flag]) + from[flag];
         int64_t found[2] = {order[place] + rows, r + 2 * rows};
         int64_t goal[2] = {r, found[(chance[r] < later) & !flag]};
@@ -228,7 +228,7 @@ int64_t read_columns(int64_t rows, int64_t length, const int64_t *places,
 }
 
 /* The rows of all leaves at some places. A leaf has three numbers in the table: the
- * addresses of its source and of out, and its bytes a row. */
+ * addresses of its source and of out, and its bytes per row. */
 int64_t gather_rows(int64_t count, int64_t length, const int64_t *places, int64_t leaves,
                     const int64_t *table)
 {
@@ -241,7 +241,7 @@ int64_t gather_rows(int64_t count, int64_t length, const int64_t *places, int64_
         int64_t bytes = table[2];
         for (int64_t r = 0; r < count; r++, out += bytes) {
             if (r + FAR < count)
-                fetch(source + places[r + FAR] * bytes, bytes < PAGE ? bytes : PAGE);
+                fetch(source + places[r + FAR] * bytes, bytes < MOST_FETCHED ? bytes : MOST_FETCHED);
             copy(out, source + places[r] * bytes, bytes);
         }
     }
@@ -306,7 +306,7 @@ int64_t relabel_batch(const int64_t *number, const double *shares)
                        number[4], (const int64_t *)number[10], (const int64_t *)number[11],
                        (char *)number[13], (char *)number[14], relabeled);
     for (int64_t r = 0; r < rows; r++)
-        changed[r] = relabeled[r] | flags[r];
+        changed[r] = relabeled[r] | (flags[r] != 0);
     return bad;
 }
 
@@ -363,10 +363,9 @@ static void copy_run(int64_t count, const int64_t *listed, const int64_t *donors
 
 /* swap.apply_swap: the rows of all leaves, in which entities are those of their donors.
  *
- * A leaf has nine numbers in the table: the rows of its source, its bytes a row, its
+ * A leaf has nine numbers in the table: the rows of its source, its bytes per row, its
  * runs of bytes, and the addresses of their entities, starts and lengths, of own, source
- * and out. Swaps are listed before they are applied, so that the processor need not
- * guess which entities are swapped.
+ * and out. Swaps are listed before they are applied, to avoid branch mispredictions.
  */
 int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities,
                   const int64_t *donors, const uint8_t *swapped, int64_t leaves,
@@ -392,7 +391,7 @@ int64_t swap_rows(int64_t first, int64_t drawn, int64_t window, int64_t entities
             int64_t count = 0;
             for (int64_t c = begin; c < end; c++) {
                 listed[count] = c;
-                count += swapped[c * entities + n];
+                count += swapped[c * entities + n] != 0;
             }
             for (int64_t i = 0; i < count; i++) {
                 int64_t here = listed[i] * entities + n;
@@ -477,7 +476,8 @@ static int64_t take_back(int64_t drawn, int64_t entities, int64_t window,
     int64_t found = 0;
     for (int64_t here = 0; here < drawn * entities; here++) {
         int64_t donor = donors[here], later = here + AHEAD, is_good = 1;
-        if (later < drawn * entities && swapped[later])
+        if (later < drawn * entities && swapped[later] && donors[later] >= 0
+            && donors[later] < length)
             for (int64_t l = 0; l < leaves; l++)
                 fetch((const char *)(values[l] + donors[later] * widths[l]),
                       widths[l] * (int64_t)sizeof(int32_t));
@@ -505,16 +505,16 @@ static int64_t take_back(int64_t drawn, int64_t entities, int64_t window,
  * is_free, order (a permutation of the windows, or 0), chance and share; how many
  * windows are chosen; the addresses of memory (listed, donors, no_donor; chosen,
  * swapped), of the counts that no_donor is added to, and of the flags; leaves and
- * states; the address of numbers about a storage that donors are from, or 0; how many
- * swaps were taken back, which is written; for each leaf what swap_rows knows; for each
- * state its address and size.
+ * states; the address of numbers about a storage that donors are from, or 0; for each
+ * leaf what swap_rows knows; for each state its address and size. Lost is set to the
+ * number of swaps that were taken back.
  *
  * About a storage: what buffer_donors knows of the eligible rows (the addresses of
  * offset and size, how many there are, whether they are int32, their address); the
  * address of the fingerprints, or 0; their number, the upper half of a fingerprint, the
  * leaves of states; the addresses of those, of their widths and of their weights.
  */
-int64_t swap_batch(int64_t *number, float swap_prob)
+int64_t swap_batch(const int64_t *number, float swap_prob, int64_t *lost)
 {
     int64_t count = number[0], first = number[1], entities = number[2];
     int64_t window = number[3], drawn = count - first, bad;
@@ -527,11 +527,11 @@ int64_t swap_batch(int64_t *number, float swap_prob)
     uint8_t *chosen = (uint8_t *)number[10], *swapped = chosen + drawn;
     uint8_t *chosen_flag = (uint8_t *)number[12], *swapped_flag = (uint8_t *)number[13];
     int64_t leaves = number[14], states = number[15];
-    const int64_t *from = (const int64_t *)number[16], *leaf = number + 18;
+    const int64_t *from = (const int64_t *)number[16], *leaf = number + 17;
     const int64_t *state = leaf + 9 * leaves;
     for (int64_t c = 0; c < drawn; c++)
         chosen[c] = !order || order[c] < number[8];
-    number[17] = 0;
+    *lost = 0;
     if (!from)
         batch_donors(count, first, entities, window, is_free, chosen, chance, swap_prob,
                      share, listed, donors, swapped, no_donor);
@@ -540,7 +540,7 @@ int64_t swap_batch(int64_t *number, float swap_prob)
                       swap_prob, share, (const int64_t *)from[0], (const int64_t *)from[1],
                       from[2], from[3], (const void *)from[4], donors, swapped, no_donor);
         if (from[5])
-            number[17] = take_back(
+            *lost = take_back(
                 drawn, entities, window, donors, swapped, no_donor, (const int64_t *)from[5],
                 from[6], from[7], from[8], (const int32_t *const *)from[9],
                 (const int64_t *)from[10], (const int64_t *const *)from[11]);

@@ -152,8 +152,8 @@ def swap_batch(
             number below ``count`` become counterfactual; on a CUDA device which ones
             do, bool. The last ``count`` windows do if it is ``None``.
         chance (torch.Tensor, optional): float32 ``[N, C]``, below 1.
-        share (torch.Tensor): float64, below 1: which donor it is, ``[N, C]``, in the
-            order ``[C, N]`` if it is one of a storage.
+        share (torch.Tensor): float64 ``[N, C]``, below 1: which donor it is. With
+            ``donors`` the same memory is read as ``[C, N]``.
         count (int): the number of windows that become counterfactual.
         window (int): rows in a window.
         swap_prob (float): the chance below which a free entity is swapped.
@@ -192,7 +192,6 @@ def swap_batch(
         *map(cuda.address, (numbers, flags, no_donor, chosen, swapped)),
         *(len(leaves), len(states)),
         0 if storage is None else ctypes.addressof(storage[0]),
-        0,
     ]
     sources = [own for own, _ in leaves] if donors is None else donors.sources
     for (own, runs), source, out in zip(leaves, sources, outs, strict=True):
@@ -200,14 +199,14 @@ def swap_batch(
     for state in states:
         tensor = outs[state] if isinstance(state, int) else state
         table += [tensor.data_ptr(), tensor.numel()]
-    given = (ctypes.c_int64 * len(table))(*table)
-    found = call("swap_batch", given, swap_prob)
+    given, lost = (ctypes.c_int64 * len(table))(*table), ctypes.c_int64()
+    found = call("swap_batch", given, swap_prob, ctypes.byref(lost))
     if found >= 0:
         row = int(numbers[windows + found])
         raise IndexError(
             f"row {row} is out of range: there are {min(map(len, sources))} rows"
         )
-    return SwappedBatch(outs, chosen, swapped, found == GOOD, given[17] > 0)
+    return SwappedBatch(outs, chosen, swapped, found == GOOD, lost.value > 0)
 
 
 def _storage_numbers(donors: DonorRows) -> tuple[Any, ...]:

@@ -524,9 +524,10 @@ class CounterfactualTransform(RandomTransform, ABC):
     @property
     def _settings(self) -> SwapSettings | None:
         """The settings of repeated swaps, ``None`` if all are done step by step."""
-        if self._goal_leaves or self.unscored == "keep":
-            return None
-        if self.draw_in_batch is not draw_batch_donors:
+        is_usual = self.draw_in_batch is draw_batch_donors and all(
+            type(x) is BufferDonors and x.goals is None for x in self._donors
+        )
+        if not is_usual or self._goal_leaves or self.unscored == "keep":
             return None
         on_gpu = self._lookahead is None and not self._donors
         return SwapSettings(self.window, self.score_key, self.keys, self.check, on_gpu)

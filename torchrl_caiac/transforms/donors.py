@@ -218,8 +218,7 @@ class BufferDonors:
         # The donors' leaves for the last plan, and the tensordict that they come from.
         self._read: tuple[SwapPlan, TensorDictBase, list[torch.Tensor]] | None = None
         # The same for functions in C, and whether fingerprints are compared.
-        self._rows: tuple[SwapPlan, TensorDictBase, bool, DonorRows | None] | None
-        self._rows = None
+        self._rows: tuple[SwapPlan, DonorIndex, bool, DonorRows | None] | None = None
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
@@ -257,11 +256,11 @@ class BufferDonors:
             ValueError: the buffer is empty, or its scores have the wrong width.
         """
         # With the storage, since the buffer may have got another one.
-        revision = self.storage, storage_revision(self.storage)
-        if self._built is None or self._built[0] != revision:
-            self._built = (revision, *self._build())
+        revision, built = (self.storage, storage_revision(self.storage)), self._built
+        if built is None or built[0] != revision:
+            self._built = built = (revision, *self._build())
             self._read = self._rows = None
-        return self._built[1:]
+        return built[1:]
 
     def _build(self) -> tuple[Any, TrajectoryIndex | None, TensorDictBase]:
         storage = self.storage
@@ -461,22 +460,26 @@ class BufferDonors:
             check (bool): whether fingerprints are compared, see :meth:`verified`.
 
         Returns:
-            DonorRows, optional: ``None`` if donors are drawn and read by the other
-            methods.
+            DonorRows, optional: ``None`` if donors are drawn and read by :meth:`draw`,
+            :meth:`verified` and :meth:`apply`.
+
+        Raises:
+            KeyError: the donors lack scores or a leaf of the batch.
+            ValueError: the donors have another layout.
         """
         index, trajectories, data = self.index()
+        is_in_order = trajectories is None or trajectories.is_storage_order
+        if not is_in_order or not isinstance(index, DonorIndex):
+            return None
         known = self._rows
         if (
             known is None
             or known[0] is not plan
-            or known[1] is not data
+            or known[1] is not index
             or known[2] != check
         ):
-            is_in_order = trajectories is None or trajectories.is_storage_order
-            found = None
-            if is_in_order and self.goals is None and isinstance(index, DonorIndex):
-                found = self._native_rows(index, data, plan, batch, check)
-            self._rows = known = plan, data, check, found
+            found = self._native_rows(index, data, plan, batch, check)
+            self._rows = known = plan, index, check, found
         return known[3]
 
     def _native_rows(
@@ -500,6 +503,7 @@ class BufferDonors:
             or not is_native_index(index, len(layout))
             or not is_native(
                 sources=[
+                    *index,
                     *sources,
                     *([] if known is None else [known]),
                     *(leaf for leaf, _ in states),

@@ -42,11 +42,11 @@ class TransformKeys:
             :class:`~torchrl_caiac.transforms.WindowGoal` writes. Swaps and later
             relabelling change goals, not this leaf. Defaults to
             ``("hindsight", "steps")``.
-        unexplained (NestedKey, optional): the flag of transitions whose goal another
-            transition achieves, so that their own action need not lead to it, bool
-            ``[*B, 1]``, which :class:`~torchrl_caiac.transforms.HindsightGoal` writes.
-            Learners that repeat actions leave these out. Defaults to ``None``: it is
-            not written.
+        unexplained (NestedKey, optional): the flag of transitions whose goal a random
+            transition of the batch achieves, so that their own action need not lead to
+            it, bool ``[*B, 1]``, which
+            :class:`~torchrl_caiac.transforms.HindsightGoal` writes. Learners that
+            repeat actions leave these out. Defaults to ``None``: it is not written.
 
     Raises:
         TypeError: a key is not a ``str`` or a tuple of them.

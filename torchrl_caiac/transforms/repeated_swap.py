@@ -68,7 +68,8 @@ class RepeatedSwap:
         settings (SwapSettings): those of the transform.
         is_unfit (bool): whether an earlier batch has shown that batches have to be
             swapped step by step: states of windows on a CUDA device are not the next
-            states before them, or what may be swapped has another form.
+            states before them, what may be swapped has another form, or donors of a
+            buffer need torch.
 
     Args:
         td (TensorDictBase): the earlier batch, ``[B * window]``, before it was swapped.
@@ -101,6 +102,8 @@ class RepeatedSwap:
             "flags": end_flag_keys(td, keys.done) if check and window > 1 else [],
             "scores": [score_key],
         }
+        if not settings.on_gpu and td.get(score_key).is_cuda:
+            raise TypeError("the batch is on a CUDA device")
         if not plan.leaves:
             raise TypeError("all entities are fixed")
         if window > 1 and leaf_of(td, STEPS_KEY) is not None:
@@ -170,8 +173,6 @@ class RepeatedSwap:
     def _need(self, leaves: dict[str, list[torch.Tensor]]) -> None:
         """Raises where values are of other types than the functions in C read."""
         rows = len(leaves["scores"][0])
-        if leaves["scores"][0].is_cuda and not self.settings.on_gpu:
-            raise TypeError("the batch is on a CUDA device")
         if max(map(len, leaves.values())) > MOST_LEAVES:
             raise TypeError("there are many leaves")
         for here, there in zip(leaves["state"], leaves["next"], strict=True):
@@ -226,18 +227,15 @@ class RepeatedSwap:
             it has to be swapped step by step; nothing was drawn for it.
 
         Raises:
+            IndexError: a donor is not a row of its storage.
+            KeyError: the donors lack scores or a leaf of the batch.
             ValueError: a state is not finite; on a CUDA device in an earlier batch, or
-                its rows or scores were wrong.
+                its rows or scores were wrong. Or the donors have another layout.
         """
-        leaves = self._leaves(td)
+        leaves = None if self.is_unfit else self._leaves(td)
         window, _, keys, check, _ = self.settings
         if leaves is None:
             return None
-        donor_rows: DonorRows | None = None
-        if donors is not None:
-            donor_rows = donors.rows(self._plan, leaves["swapped"], check)
-            if donor_rows is None:
-                return None
         scores = leaves["scores"][0]
         if not 0 < count <= len(scores) // window:
             return None
@@ -253,6 +251,10 @@ class RepeatedSwap:
                     return None
         elif check and not batch_fits(states, scores, known, *rest):
             return None
+        donor_rows: DonorRows | None = None
+        if donors is not None:
+            donor_rows = donors.rows(self._plan, leaves["swapped"], check)
+            self.is_unfit = donor_rows is None
         windows, entities = len(scores) // window, scores.shape[1]
         free = swappable(scores).contiguous()
         self.is_unfit = self.is_unfit or not (

@@ -203,7 +203,11 @@ def test_goals_of_other_rows_are_marked() -> None:
 def test_copies_relabel_too(send: Any) -> None:
     td = batch()
     goals, fresh = pair(td)
-    assert_same(relabelled(send(goals), td)[0], relabelled(fresh, td)[0])
+    goals = send(goals)
+    for is_later in (False, True):  # a copy reads the structure anew
+        out, is_repeated = relabelled(goals, td)
+        assert is_repeated == is_later
+        assert_same(out, relabelled(fresh, td)[0])
 
 
 @pytest.mark.parametrize(
@@ -245,12 +249,27 @@ def test_errors_are_those_of_single_steps() -> None:
     goals.keep_goals({"desired_goal": torch.zeros(7, 3)})
     with pytest.raises(RuntimeError, match="drawn for 7 rows"):
         goals(td)
+    goals.keep_goals({"other": torch.zeros(30, 3)})
+    with pytest.raises(KeyError, match="desired_goal"):
+        goals(td)
     out = relabelled(goals, td)[0]
     with pytest.raises(RuntimeError, match="already relabelled"):
         relabelled(goals, out)
-    td["next", "observation"][3] = torch.nan
+    td["next", "observation"][:] = torch.nan
     with pytest.raises(ValueError, match="reward_fn returned nan for row"):
         relabelled(goals, td)
+
+
+def test_flags_of_other_bytes_than_0_and_1() -> None:
+    td = batch()
+    goals, fresh = pair(td, future=0.0, counterfactual=1.0)
+    odd = td.clone()
+    flags = td["caiac", "counterfactual"]
+    odd["caiac", "counterfactual"] = (flags.byte() * 200).view(torch.bool)
+    out, is_repeated = relabelled(goals, odd)
+    assert is_repeated and torch.equal(out["hindsight", "relabeled"], flags)
+    wanted = relabelled(fresh, td)[0]
+    assert torch.equal(out["desired_goal"], wanted["desired_goal"])
 
 
 @pytest.mark.gpu

@@ -11,13 +11,17 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._batches import with_leaves
 from torchrl_caiac._keys import floating
-from torchrl_caiac._random import draw_below, draw_numbers
+from torchrl_caiac._random import draw_numbers
 from torchrl_caiac._sampling import hindsight_sources, is_native, relabel_rows
 from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_number
-from torchrl_caiac.transforms.goals.future import FutureGoal, draw_steps
+from torchrl_caiac.transforms.goals.future import (
+    FutureGoal,
+    draw_goal_offset,
+    draw_steps,
+)
 from torchrl_caiac.transforms.goals.repeated_relabel import RepeatedRelabel, unexplained
 from torchrl_caiac.transforms.indexing import window_starts
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -156,11 +160,8 @@ class HindsightGoal(FutureGoal):
         tensor([-0., -0., -0.])
     """
 
+    # Relabels batches like the last one, if it can.
     _repeated: RepeatedRelabel | None
-
-    def _reset_state(self) -> None:
-        super()._reset_state()
-        self._repeated = None
 
     def __init__(
         self,
@@ -244,8 +245,8 @@ class HindsightGoal(FutureGoal):
                 steps = draw_steps(rows.shape, self.p, rows.device, generator)
                 later = trajectories.ahead(rows, steps)
             else:
-                steps = draw_below(
-                    trajectories.remaining(rows) + 1, generator=generator
+                steps = draw_goal_offset(
+                    trajectories.remaining(rows), {"uniform": 1.0}, generator=generator
                 )
                 later = trajectories.later(rows, steps)
             self.keep_goals(self.read_goals(data, later))
@@ -471,6 +472,13 @@ class HindsightGoal(FutureGoal):
         out = self.apply_parameters(tensordict, draw)
         self._repeated = self._repeated_from(tensordict)
         return out if len(shape) == 1 else out.reshape(shape)
+
+    def _reset_state(self) -> None:
+        super()._reset_state()
+        self._repeated = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_repeated": None}
 
     def _repeated_from(self, td: TensorDictBase) -> RepeatedRelabel | None:
         """Returns what relabels batches like this one, if it can."""

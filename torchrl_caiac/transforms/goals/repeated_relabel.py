@@ -20,7 +20,7 @@ __all__ = ["RepeatedRelabel", "unexplained"]
 
 
 def unexplained(source: torch.Tensor) -> torch.Tensor:
-    """Returns which rows have goals that other rows achieve.
+    """Returns which rows have goals that random rows of the batch achieve.
 
     Args:
         source (torch.Tensor): int64 ``[B]``, see
@@ -83,7 +83,7 @@ class RepeatedRelabel:
         if leaf_of(td, after) is None:
             self._written = [desired_key]
         leaves = self._batch.leaves(td)
-        if leaves is None:
+        if leaves is None or not is_native(*leaves):
             raise TypeError("there are leaves that need torch")
         values, desired, *flags = leaves
         rows = td.shape[0]
@@ -118,13 +118,13 @@ class RepeatedRelabel:
 
         Raises:
             KeyError: rewards are missing.
-            ValueError: the rewards are wrong.
+            ValueError: a reward is NaN or infinite, or rewards have the wrong shape.
         """
         leaves = self._batch.leaves(td)
-        if leaves is None or (future is None and shares[0] > 0):
+        later = None if future is None else future.get(self._desired_key)
+        if leaves is None or (later is None and shares[0] > 0):
             return None
         values, desired, *given = leaves
-        later = None if future is None else future.get(self._desired_key)
         if later is not None:
             leaves = [*leaves, later]
             if (later.shape, later.dtype) != (desired.shape, desired.dtype):
