@@ -80,6 +80,8 @@ def test_rows_are_those_of_a_tensor_storage(mapped, index, tmp_path):
     data["rows", "next"] = torch.arange(12).flip(0)[:, None].expand(12, 2)
     if mapped:
         data = data.memmap(tmp_path)
+    else:
+        data["none"] = torch.zeros(12, 0)
     before = data.clone()
     try:
         wanted = TensorStorage(data).get(index)

@@ -281,6 +281,34 @@ def test_donors_that_are_written_to_are_taken_back(row: int) -> None:
     assert out["caiac", "swapped"].any()
 
 
+@pytest.mark.parametrize("change", ["states", "known", "removed", "added"])
+def test_leaves_of_donors_that_are_replaced(change: str) -> None:
+    td, data = batch(FLAT, 100, 1), batch(FLAT, 30, 1, seed=1)
+    key = fingerprint_key(SCORE)
+    known = data.pop(key) if change == "added" else data[key]
+    transform, fresh = pair(td, donors=TensorStorage(data))
+    fresh(td)  # finds the eligible donors
+    for some in (transform, fresh):  # each has its own storage
+        rows = storage_data(some.donors)
+        if change != "known":
+            rows["observation"] = rows["observation"] + 5.0
+        if change == "known":
+            rows[key] = known + (1 << 40)
+        elif change == "added":
+            rows[key] = known
+        elif change == "removed":
+            del rows[key]
+        some.reset_no_donor_count()
+        some.generator.manual_seed(1)
+    out, is_repeated = taken(transform, td)
+    assert is_repeated
+    assert_same(out, fresh(td))
+    assert torch.equal(transform.no_donor_count, fresh.no_donor_count)
+    is_lost = change != "removed"
+    assert bool(out["caiac", "swapped"].any()) != is_lost
+    assert bool(transform.no_donor_count.any()) == is_lost
+
+
 @pytest.mark.parametrize("case", ["bits", "ring", "goals", "subclass"])
 def test_donors_that_are_read_step_by_step(
     case: str, monkeypatch: pytest.MonkeyPatch

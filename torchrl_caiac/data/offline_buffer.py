@@ -49,7 +49,7 @@ class OfflineStorage(TensorStorage):
         """
         rows = self._rows(index)
         if rows is not None:
-            with suppress(IndexError):  # negative, or too large
+            with suppress(IndexError, RuntimeError):  # negative, or too large
                 return rows_of(storage_data(self), rows)
         return super().get(index)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,7 +20,7 @@ from torchrl_caiac._fingerprints import (
     upper_half,
 )
 from torchrl_caiac._sampling import DonorRows, is_native
-from torchrl_caiac._torchrl import storage_revision, storage_rows
+from torchrl_caiac._torchrl import leaf_of, storage_revision, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
@@ -159,6 +160,11 @@ def eligible_starts(
     return found if int(found.size.sum()) > _MOST_LISTED else found.listed()
 
 
+def _are(some: Sequence[Any], others: Sequence[Any]) -> bool:
+    """Returns whether two sequences have the same objects."""
+    return len(some) == len(others) and all(map(operator.is_, some, others))
+
+
 class BufferDonors:
     """A replay buffer whose windows are donors of entities.
 
@@ -215,10 +221,12 @@ class BufferDonors:
         self._built: tuple[Any, Any, TrajectoryIndex | None, TensorDictBase] | None = (
             None
         )
-        # The donors' leaves for the last plan, and the tensordict that they come from.
-        self._read: tuple[SwapPlan, TensorDictBase, list[torch.Tensor]] | None = None
+        # The donors' leaves for the last plan, and what they were read from.
+        self._read: tuple[SwapPlan, list[Any], list[torch.Tensor]] | None = None
         # The same for functions in C, and whether fingerprints are compared.
-        self._rows: tuple[SwapPlan, DonorIndex, bool, DonorRows | None] | None = None
+        self._rows: (
+            tuple[SwapPlan, DonorIndex, bool, list[Any], DonorRows | None] | None
+        ) = None
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
@@ -388,10 +396,10 @@ class BufferDonors:
         _, trajectories, data = self.index()
         if not len(draw.swapped):
             return td.copy()
-        known = self._read
-        if known is None or known[0] is not plan or known[1] is not data:
+        known, entries = self._read, [data, *self._entries(data, plan)]
+        if known is None or known[0] is not plan or not _are(known[1], entries):
             own = [values[leaf.place] for leaf in plan.leaves]
-            self._read = known = plan, data, self._sources(data, plan, own)
+            self._read = known = plan, entries, self._sources(data, plan, own)
         sources, goals = known[2], self.goals
 
         def donor_goals(leaf: SwapLeaf) -> torch.Tensor:
@@ -471,16 +479,24 @@ class BufferDonors:
         is_in_order = trajectories is None or trajectories.is_storage_order
         if not is_in_order or not isinstance(index, DonorIndex):
             return None
-        known = self._rows
+        known, entries = self._rows, self._entries(data, plan)
         if (
             known is None
             or known[0] is not plan
             or known[1] is not index
             or known[2] != check
+            or not _are(known[3], entries)
         ):
             found = self._native_rows(index, data, plan, batch, check)
-            self._rows = known = plan, index, check, found
-        return known[3]
+            self._rows = known = plan, index, check, entries, found
+        return known[4]
+
+    def _entries(self, data: TensorDictBase, plan: SwapPlan) -> list[Any]:
+        """Returns what is read of the donors, entries that may be replaced by others."""
+        layout = self.layout
+        keys = [leaf.key for leaf in plan.leaves]
+        keys += [key for own in layout.in_keys for key in (own, layout.next(own))]
+        return [leaf_of(data, key) for key in (*keys, fingerprint_key(self.score_key))]
 
     def _native_rows(
         self,
@@ -499,7 +515,7 @@ class BufferDonors:
             states = hashed_leaves(data, layout.in_keys, after, len(known))
         if (
             states is None
-            or (known is not None and known.dtype is not torch.int64)
+            or (known is not None and (known.dtype, known.ndim) != (torch.int64, 1))
             or not is_native_index(index, len(layout))
             or not is_native(
                 sources=[
