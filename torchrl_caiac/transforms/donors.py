@@ -492,7 +492,7 @@ class BufferDonors:
         return known[4]
 
     def _entries(self, data: TensorDictBase, plan: SwapPlan) -> list[Any]:
-        """Returns what is read of the donors, entries that may be replaced by others."""
+        """Returns what is read of the donors, which may be replaced by assignment."""
         layout = self.layout
         keys = [leaf.key for leaf in plan.leaves]
         keys += [key for own in layout.in_keys for key in (own, layout.next(own))]
