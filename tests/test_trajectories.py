@@ -18,7 +18,6 @@ from torchrl.data import (
     TensorStorage,
 )
 
-from torchrl_caiac._sampling import only_torch
 from torchrl_caiac.trajectories import flat_rows, trajectory_index
 
 
@@ -218,8 +217,6 @@ def check(index, later):
     for steps in (0, 1, 2, 100):
         wanted = [(row, *later[row])[: steps + 1][-1] for row in range(count)]
         assert index.ahead(rows, torch.full_like(rows, steps)).tolist() == wanted
-        with only_torch():
-            assert index.ahead(rows, torch.full_like(rows, steps)).tolist() == wanted
     every = torch.arange(count)
     assert index.position(index.rows(every)).tolist() == every.tolist()
     assert sum(index.lengths.tolist()) == count

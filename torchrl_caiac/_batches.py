@@ -96,6 +96,11 @@ class KnownBatch:
         # The names of the entries of each node, and their classes.
         self._nodes: dict[tuple[str, ...], tuple[tuple[str, ...], list[type]]] = {}
         self._shape, self._device = td.batch_size, td.device
+        # Of the last keys that were written: see _planned.
+        self._plan: (
+            tuple[tuple[NestedKey, ...], list[tuple[int, str]], list[tuple[int, str]]]
+            | None
+        ) = None
         self._walk(td, ())
         self._keys = [((key,) if isinstance(key, str) else tuple(key)) for key in keys]
         self._kinds = [_kind(td.get(key)) for key in keys]
@@ -153,20 +158,33 @@ class KnownBatch:
         Returns:
             TensorDict: the copy.
         """
-        nodes: dict[tuple[str, ...], dict[str, Any]] = {}
-        for path in self._nodes:
-            node = nodes[path[:-1]][path[-1]] if path else td
-            nodes[path] = dict(entries_of(node) or {})
-        for key, leaf in leaves.items():
-            path = (key,) if isinstance(key, str) else tuple(key)
-            for end in range(len(path)):
-                nodes.setdefault(path[:end], {})
-            nodes[path[:-1]][path[-1]] = leaf
-        out = nodes.pop(())
-        for path in sorted(nodes, key=len, reverse=True):
-            made = tensordict_of(nodes[path], self._shape, self._device)
-            (nodes[path[:-1]] if len(path) > 1 else out)[path[-1]] = made
-        return tensordict_of(out, self._shape, self._device)
+        keys = tuple(leaves)
+        plan = self._plan
+        if plan is None or plan[0] != keys:
+            self._plan = plan = keys, *self._planned(keys)
+        _, parents, places = plan
+        nodes = [dict(entries_of(td) or {})]
+        for parent, name in parents:
+            nodes.append(dict(entries_of(nodes[parent].get(name)) or {}))
+        for (number, name), leaf in zip(places, leaves.values(), strict=True):
+            nodes[number][name] = leaf
+        for number in range(len(parents), 0, -1):
+            parent, name = parents[number - 1]
+            made = tensordict_of(nodes[number], self._shape, self._device)
+            nodes[parent][name] = made
+        return tensordict_of(nodes[0], self._shape, self._device)
+
+    def _planned(
+        self, keys: Sequence[NestedKey]
+    ) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
+        """Returns the node above each node but the first, and those of keys."""
+        paths = dict.fromkeys(self._nodes)
+        split = [(key,) if isinstance(key, str) else tuple(key) for key in keys]
+        for key in split:
+            paths |= dict.fromkeys(key[:end] for end in range(len(key)))
+        number = {path: i for i, path in enumerate(sorted(paths, key=len))}
+        parents = [(number[path[:-1]], path[-1]) for path in number if path]
+        return parents, [(number[key[:-1]], key[-1]) for key in split]
 
 
 def _kind(leaf: Tensor) -> tuple[Any, ...]:

@@ -11,7 +11,6 @@ from torchrl.data import ReplayBuffer, TensorStorage
 
 from torchrl_caiac._checks import check_local
 from torchrl_caiac._keys import missing_key, path
-from torchrl_caiac._sampling import is_native, rows_ahead
 from torchrl_caiac._torchrl import (
     is_in_order_of_time,
     last_written,
@@ -120,21 +119,12 @@ class TrajectoryIndex(NamedTuple):
         """Returns the rows that are ``steps`` later, or the trajectory's last ones.
 
         Args:
-            rows (torch.Tensor): int64 ``[B]``.
-            steps (torch.Tensor): int64 ``[B]``, at least 0.
+            rows (torch.Tensor): int64 ``[*]``.
+            steps (torch.Tensor): int64 ``[*]``, at least 0.
 
         Returns:
-            torch.Tensor: int64 ``[B]``.
+            torch.Tensor: int64 ``[*]``.
         """
-        if (
-            self.order is None
-            and rows.dtype is steps.dtype is torch.int64
-            and rows.shape == steps.shape
-            and rows.ndim == 1
-            and rows.device.type == "cpu"
-            and is_native(rows, steps, sources=[self.left])
-        ):
-            return rows_ahead(rows, steps, self.left)
         return self.later(rows, torch.minimum(steps, self.remaining(rows)))
 
     def numbers(self) -> torch.Tensor:

@@ -20,9 +20,9 @@ __all__ = [
     "free_windows",
     "gather_rows",
     "look",
+    "read_ahead",
     "read_columns",
     "row_sums",
-    "rows_ahead",
     "rows_equal",
     "rows_fit",
     "state_matches",
@@ -130,32 +130,6 @@ def gather_rows(
     return found
 
 
-def rows_ahead(
-    rows: torch.Tensor, steps: torch.Tensor, left: torch.Tensor
-) -> torch.Tensor:
-    """Returns rows that are some steps later, in a ring, on the CPU.
-
-    Args:
-        rows (torch.Tensor): int64 ``[B]``.
-        steps (torch.Tensor): int64 ``[B]``, at least 0.
-        left (torch.Tensor): int32 or int64 ``[T]``, the most steps from each row.
-
-    Returns:
-        torch.Tensor: int64 ``[B]``.
-
-    Raises:
-        IndexError: a row is out of range, or its steps are negative.
-    """
-    found = torch.empty_like(rows)
-    count, length = rows.shape[0], left.shape[0]
-    is_short = left.dtype is torch.int32
-    call_with_rows(
-        *("rows_ahead", rows, length, count, length),
-        *(rows, steps, is_short, left, found),
-    )
-    return found
-
-
 def rows_equal(own: torch.Tensor, source: torch.Tensor, rows: torch.Tensor) -> bool:
     """Returns whether rows are those of a source to the bit, on the CPU.
 
@@ -211,6 +185,44 @@ def read_columns(
         runs.length,
         source,
         out,
+    )
+    return out
+
+
+def read_ahead(
+    source: torch.Tensor,
+    columns: tuple[int, ...],
+    rows: torch.Tensor,
+    steps: torch.Tensor,
+    left: torch.Tensor,
+) -> torch.Tensor:
+    """Returns some columns of rows that are some steps after others, on the CPU.
+
+    Args:
+        source (torch.Tensor): ``[T, D]``, a ring.
+        columns (tuple of int): the columns, at least one.
+        rows (torch.Tensor): int64 ``[M]``.
+        steps (torch.Tensor): int64 ``[M]``, at least 0.
+        left (torch.Tensor): int32 or int64 ``[T]``, the most steps from each row.
+
+    Returns:
+        torch.Tensor: ``[M, len(columns)]``.
+
+    Raises:
+        IndexError: a row is out of range, or its steps are negative.
+    """
+    count, length = rows.shape[0], left.shape[0]
+    out = source.new_empty(count, len(columns))
+    size = source.element_size()
+    runs = column_runs(columns, size)
+    places = torch.empty_like(rows)
+    call_with_rows(
+        "read_ahead",
+        rows,
+        length,
+        *(count, length, rows, steps, left.dtype is torch.int32, left),
+        *(source.shape[1] * size, runs.start.shape[0], runs.start, runs.length),
+        *(source, places, out),
     )
     return out
 

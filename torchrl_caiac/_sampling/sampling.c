@@ -248,20 +248,23 @@ int64_t gather_rows(int64_t count, int64_t length, const int64_t *places, int64_
     return GOOD;
 }
 
-/* TrajectoryIndex.ahead: rows that are some steps later, at most the last one of their
- * trajectory. */
-int64_t rows_ahead(int64_t count, int64_t length, const int64_t *rows,
-                   const int64_t *steps, int64_t is_short, const void *left, int64_t *out)
+/* Some columns of rows that are some steps after others, at most the last one of their
+ * trajectory; places is memory. */
+int64_t read_ahead(int64_t rows, int64_t length, const int64_t *row, const int64_t *steps,
+                   int64_t is_short, const void *left, int64_t row_bytes, int64_t runs,
+                   const int64_t *run_start, const int64_t *run_bytes, const char *source,
+                   int64_t *places, char *out)
 {
-    for (int64_t r = 0; r < count; r++) {
-        int64_t row = rows[r], most;
-        if (row < 0 || row >= length || steps[r] < 0)
+    for (int64_t r = 0; r < rows; r++) {
+        int64_t most, place = row[r];
+        if (place < 0 || place >= length || steps[r] < 0)
             return r;
-        most = is_short ? ((const int32_t *)left)[row] : ((const int64_t *)left)[row];
-        row += steps[r] < most ? steps[r] : most;
-        out[r] = row < length ? row : row - length;
+        most = is_short ? ((const int32_t *)left)[place] : ((const int64_t *)left)[place];
+        place += steps[r] < most ? steps[r] : most;
+        places[r] = place < length ? place : place - length;
     }
-    return GOOD;
+    return read_columns(rows, length, places, row_bytes, runs, run_start, run_bytes,
+                        source, out);
 }
 
 /* HindsightGoal: the goals of rows by their sources, of hindsight_sources, and the goals

@@ -121,7 +121,8 @@ class GoalFunction:
             raise ValueError(
                 f"{self.name} returned {found.dtype}, expected real numbers"
             )
-        return found.reshape(rows).to(achieved.device)
+        found = found if found.ndim == 1 else found.reshape(rows)
+        return found if found.device == achieved.device else found.to(achieved.device)
 
 
 def _extra_arguments(function: Any, name: str) -> dict[str, str]:

@@ -259,7 +259,7 @@ class RepeatedSwap:
         free = swappable(scores).contiguous()
         self.is_unfit = self.is_unfit or not (
             (free.shape, free.dtype) == ((windows, entities), torch.bool)
-            and is_native(free, no_donor, scores)
+            and is_native(free, no_donor)
         )
         if self.is_unfit:
             return None

@@ -387,7 +387,8 @@ def _merge(
     """Returns stored values ``[B, ...]`` with new ones from row ``first`` on."""
     stored = stored.to(new.dtype)
     tail = stored[first:] if first else stored
-    new = new.reshape(tail.shape).to(stored.device)
+    if new.shape != tail.shape or new.device != stored.device:
+        new = new.reshape(tail.shape).to(stored.device)
     if where is not None:
         new = torch.where(where.view(tail.shape), new, tail)
     return torch.cat([stored[:first], new]) if first else new

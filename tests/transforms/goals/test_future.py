@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 
 from torchrl_caiac import EntityLayout
+from torchrl_caiac._sampling import only_torch
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
 from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
 
@@ -94,6 +98,35 @@ def test_flat_goals(kind: str, chosen: list[int] | None, tmp_path) -> None:
     wanted = [[4.0 * row + 3, 4.0 * row + 1] for row in chosen or [0, 1, 2]]
     for goals in both(FLAT):
         assert goals.read_goals(data, rows)["desired_goal"].tolist() == wanted
+
+
+@pytest.mark.parametrize("written", [5, 7, 9])  # of 7: part of a storage, and a ring
+@pytest.mark.parametrize("mapped", [False, True])
+def test_goals_ahead_end_with_the_trajectory(
+    written: int, mapped: bool, tmp_path
+) -> None:
+    storage = LazyMemmapStorage(7, scratch_dir=tmp_path)
+    rb = ReplayBuffer(storage=storage if mapped else LazyTensorStorage(7))
+    for row in range(written):
+        state = torch.full((1, 4), float(row))
+        done = torch.tensor([[row == 3]])
+        after = {"observation": state, "done": done}
+        rb.extend(TensorDict({"episode": torch.tensor([row > 3]), "next": after}, [1]))
+    for goals in both(FLAT):
+        data, trajectories = goals.stored(rb.storage)
+        rows = torch.arange(len(rb)).repeat(2)
+        time = data["next", "observation"][rows, 0].int()
+        ends = torch.where(time < 4, 3, written - 1)
+        for steps in (torch.zeros_like(rows), rows % 3, rows + 99):
+            wanted = torch.minimum(time + steps, ends)[:, None].expand(-1, 2)
+            for block in (nullcontext(), only_torch()):
+                with block:
+                    found = goals.read_goals_ahead(data, trajectories, rows, steps)
+                assert torch.equal(found["desired_goal"], wanted.float())
+        for bad in ([7, 0], [-1, 0], [0, -1]):
+            row, step = (torch.tensor([number]) for number in bad)
+            with pytest.raises((IndexError, RuntimeError)):
+                goals.read_goals_ahead(data, trajectories, row, step)
 
 
 @pytest.mark.parametrize("chosen", [None, [2, 0, 2]])

@@ -15,7 +15,7 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
 from torchrl_caiac._random import draw_below, draw_numbers
-from torchrl_caiac._sampling import is_native, read_columns
+from torchrl_caiac._sampling import is_native, read_ahead, read_columns
 from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
@@ -369,6 +369,41 @@ class FutureGoal(RandomTransform, SampleUnit):
         if rows is not None:
             found = {key: pick_rows(leaf, rows) for key, leaf in found.items()}
         return found
+
+    def read_goals_ahead(
+        self,
+        data: TensorDictBase,
+        trajectories: TrajectoryIndex,
+        rows: torch.Tensor,
+        steps: torch.Tensor,
+    ) -> dict[NestedKey, torch.Tensor]:
+        """Reads goals some steps after rows, at most at the trajectory's end.
+
+        Args:
+            data (TensorDictBase): what ``rows`` are rows of, ``[T]``.
+            trajectories (TrajectoryIndex): its trajectories.
+            rows (torch.Tensor): int64 ``[M]``.
+            steps (torch.Tensor): int64 ``[M]``, at least 0.
+
+        Returns:
+            dict: the goals ``[M, ...]``, as of :meth:`read_goals`.
+
+        Raises:
+            KeyError: the data lack the leaf that goals are read from.
+        """
+        if self.layout.is_flat and trajectories.order is None:
+            source, left = self.flat_source(data), trajectories.left
+            if (
+                (rows.ndim, rows.dtype, rows.device.type) == (1, torch.int64, "cpu")
+                and left.dtype in (torch.int32, torch.int64)
+                and steps.shape == rows.shape
+                and len(left) <= len(source)
+                and is_native(rows, steps, sources=[source, left])
+            ):
+                columns = self._goal_columns[1]
+                goals = read_ahead(source, columns, rows, steps, left)
+                return {self.layout.desired_goal_key: goals}
+        return self.read_goals(data, trajectories.ahead(rows, steps))
 
     # --- copying ---------------------------------------------------------------------
 

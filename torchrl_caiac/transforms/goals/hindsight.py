@@ -243,13 +243,13 @@ class HindsightGoal(FutureGoal):
             generator = self.generator
             if self.strategy == "geometric":
                 steps = draw_steps(rows.shape, self.p, rows.device, generator)
-                later = trajectories.ahead(rows, steps)
+                goals = self.read_goals_ahead(data, trajectories, rows, steps)
             else:
                 steps = draw_goal_offset(
                     trajectories.remaining(rows), {"uniform": 1.0}, generator=generator
                 )
-                later = trajectories.later(rows, steps)
-            self.keep_goals(self.read_goals(data, later))
+                goals = self.read_goals(data, trajectories.later(rows, steps))
+            self.keep_goals(goals)
         return index, info
 
     def generate_parameters(
