@@ -319,7 +319,9 @@ def test_rows_of_are_those_of_an_index(kind):
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("mapped", [False, True])
-def test_rows_of_all_kinds_of_leaves(mapped, threads, tmp_path):
+@pytest.mark.parametrize("cached", [0, 1 << 23])
+def test_rows_of_all_kinds_of_leaves(mapped, threads, cached, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchrl_caiac._batches._CACHED", cached)
     td = TensorDict({"wide": torch.rand(50, 3000), "none": torch.zeros(50, 0)}, [50])
     for number, dtype in enumerate(
         [torch.bool, torch.int16, torch.bfloat16, torch.complex64, torch.float64]

@@ -23,6 +23,7 @@ __all__ = ["KnownBatch", "rows_of", "with_leaves"]
 
 # Values of a leaf above which torch's threads are faster.
 _MOST_GATHERED = 1 << 17
+_FEW, _CACHED = 2048, 1 << 23  # rows, and bytes of a storage
 
 
 def with_leaves(
@@ -229,7 +230,7 @@ def rows_of(td: Any, rows: Tensor) -> Any:
 def _list_tensors(td: Any, found: list[Tensor]) -> None:
     """Lists the tensors of a tensordict that :func:`_picked` takes from ``found``."""
     if type(td) in (Tensor, MemoryMappedTensor):
-        found.append(td.as_subclass(Tensor))
+        found.append(td if type(td) is Tensor else td.as_subclass(Tensor))
         return
     for entry in (entries_of(td) or {}).values():
         _list_tensors(entry, found)
@@ -238,7 +239,11 @@ def _list_tensors(td: Any, found: list[Tensor]) -> None:
 def _is_gathered(sources: Sequence[Tensor], rows: Tensor) -> bool:
     """Returns whether rows are read in C."""
     kind = rows.ndim, rows.dtype, rows.device.type
-    if kind != (1, torch.int64, "cpu") or not is_native(rows, sources=sources):
+    if kind != (1, torch.int64, "cpu"):
+        return False
+    # Few rows of a storage that is in the cache take torch no longer.
+    is_few = rows.shape[0] < _FEW and sum(x.nbytes for x in sources) < _CACHED
+    if is_few or not is_native(rows, sources=sources):
         return False
     length = sources[0].shape[0] if sources else 0
     if not length:
