@@ -363,7 +363,7 @@ def bench_operations(
 
 # Batches in which the share of free entities and stored end flags are looked at.
 FIRST_BATCHES = 21
-MOST_OPERATIONS = {"swap": 20, "lookahead": 30, "goals": 45, "donors": 20}
+MOST_OPERATIONS = {"swap": 20, "lookahead": 30, "goals": 50, "donors": 20}
 
 LABELS = {
     "swap": "swap",
