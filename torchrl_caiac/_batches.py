@@ -131,6 +131,8 @@ class KnownBatch:
         Returns:
             list of torch.Tensor, optional: the leaves, in the order of the keys.
         """
+        if not self._nodes:  # of a copy in another process
+            return None
         nodes: dict[tuple[str, ...], dict[str, Any]] = {}
         for path, (names, kinds) in self._nodes.items():
             node = nodes[path[:-1]][path[-1]] if path else td
@@ -174,6 +176,10 @@ class KnownBatch:
             made = tensordict_of(nodes[number], self._shape, self._device)
             nodes[parent][name] = made
         return tensordict_of(nodes[0], self._shape, self._device)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Not all classes of entries can be pickled.
+        return {**self.__dict__, "_nodes": {}, "_plan": None}
 
     def _planned(
         self, keys: Sequence[NestedKey]

@@ -221,8 +221,10 @@ def test_copies_swap_too(send: Any) -> None:
     td = batch(FLAT, 100, 1)
     transform = CAIACTransform(FLAT, 0.5)
     repeated(transform, td)
-    out, is_repeated = taken(send(transform), td)
-    assert is_repeated and out["caiac", "swapped"].any()
+    transform = send(transform)
+    for is_later in (False, True):  # a copy reads the structure anew
+        out, is_repeated = taken(transform, td)
+        assert is_repeated == is_later and out["caiac", "swapped"].any()
 
 
 def test_texts_stay() -> None:

@@ -389,6 +389,7 @@ class FutureGoal(RandomTransform, SampleUnit):
             dict: the goals ``[M, ...]``, as of :meth:`read_goals`.
 
         Raises:
+            IndexError: a row is out of range.
             KeyError: the data lack the leaf that goals are read from.
         """
         if self.layout.is_flat and trajectories.order is None:
