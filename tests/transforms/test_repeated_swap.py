@@ -283,6 +283,16 @@ def test_donors_that_are_written_to_are_taken_back(row: int) -> None:
     assert out["caiac", "swapped"].any()
 
 
+@pytest.mark.parametrize("block", [nullcontext, only_torch])
+def test_fewer_donors_than_rows_of_a_window(block: Any) -> None:
+    td, donors = batch(FLAT, 100, 3), TensorStorage(batch(FLAT, 2, 1))
+    transform = CAIACTransform(FLAT, 0.5, window=3, donors=donors)
+    with block():
+        out = transform(td)
+    assert torch.equal(out["observation"], td["observation"])
+    assert transform.no_donor_count.any() and not out["caiac", "swapped"].any()
+
+
 @pytest.mark.parametrize("change", ["states", "known", "removed", "added"])
 def test_leaves_of_donors_that_are_replaced(change: str) -> None:
     td, data = batch(FLAT, 100, 1), batch(FLAT, 30, 1, seed=1)

@@ -394,7 +394,8 @@ class BufferDonors:
             TensorDictBase: a shallow copy with new leaves.
         """
         _, trajectories, data = self.index()
-        if not len(draw.swapped):
+        # Fewer rows than a window has are never donors.
+        if not len(draw.swapped) or len(data) < self.window:
             return td.copy()
         known, entries = self._read, [data, *self._entries(data, plan)]
         if known is None or known[0] is not plan or not _are(known[1], entries):
