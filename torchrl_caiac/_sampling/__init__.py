@@ -14,6 +14,7 @@ from torchrl_caiac._sampling.goals import (
     hindsight_sources,
     relabel_batch,
     relabel_rows,
+    window_goals,
 )
 from torchrl_caiac._sampling.native import is_native, only_torch, plain
 from torchrl_caiac._sampling.on_cuda import LEAVES as MOST_LEAVES
@@ -60,4 +61,5 @@ __all__ = [
     "state_matches",
     "swap_batch",
     "swap_rows",
+    "window_goals",
 ]

@@ -9,10 +9,18 @@ from typing import NamedTuple
 import torch
 
 from torchrl_caiac._sampling import on_cuda as cuda
-from torchrl_caiac._sampling.on_cpu import call, call_with_rows
+from torchrl_caiac._sampling.on_cpu import call, call_with_rows, check_rows
 from torchrl_caiac._sampling.rows import column_runs, device_numbers
 
-__all__ = ["RelabeledBatch", "hindsight_sources", "relabel_batch", "relabel_rows"]
+__all__ = [
+    "RelabeledBatch",
+    "hindsight_sources",
+    "relabel_batch",
+    "relabel_rows",
+    "window_goals",
+]
+
+_NO_WINDOWS = -3
 
 
 def hindsight_sources(
@@ -181,3 +189,54 @@ def relabel_batch(
         *(given, (ctypes.c_double * 3)(*shares)),
     )
     return RelabeledBatch(goals, achieved, relabeled, changed, memory[1])
+
+
+def window_goals(
+    rows: torch.Tensor,
+    window: int,
+    left: torch.Tensor,
+    bounds: Sequence[tuple[int, float]],
+    numbers: Sequence[torch.Tensor | None],
+    source: torch.Tensor,
+    columns: tuple[int, ...],
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Returns the goals of the rows of windows, on the CPU.
+
+    Args:
+        rows (torch.Tensor): int64 ``[W * window]``, window by window.
+        window (int): rows in a window.
+        left (torch.Tensor): int32 or int64 ``[T]``, the number of later rows in the
+            trajectory of each row.
+        bounds (sequence of tuple): strategies, 0, 1 or 2, with the least ``chance`` for
+            which they are taken, ascending from 0.
+        numbers (sequence of torch.Tensor): see ``GoalNumbers``, ``[W]`` each.
+        source (torch.Tensor): what goals are read from, ``[T, D]``, a ring.
+        columns (tuple of int): its columns that are goals, ``G``.
+
+    Returns:
+        tuple of torch.Tensor, optional: the goals ``[W * window, G]``, and the steps
+        from each row to its goal, int64 ``[W * window, 1]``; ``None`` if the rows are
+        not windows within trajectories.
+
+    Raises:
+        IndexError: the first row of a window is out of range.
+    """
+    count, length = rows.shape[0], left.shape[0]
+    goals = source.new_empty(count, len(columns))
+    steps = rows.new_empty(count, 1)
+    places = rows.new_empty(count // window)
+    size = source.element_size()
+    runs = column_runs(columns, size)
+    given = rows, left, *numbers, source, runs.start, runs.length, places, goals, steps
+    table = [
+        *(count // window, window, length, left.dtype is torch.int32, len(bounds)),
+        *(source.shape[1] * size, len(columns) * size, runs.start.shape[0]),
+        *map(cuda.address, given),
+        *(kind for kind, _ in bounds),
+    ]
+    least = (ctypes.c_float * len(bounds))(*(least for _, least in bounds))
+    place = call("window_goals", (ctypes.c_int64 * len(table))(*table), least)
+    if place == _NO_WINDOWS:
+        return None
+    check_rows(place, rows, length)
+    return goals, steps

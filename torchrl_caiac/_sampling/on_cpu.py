@@ -20,7 +20,7 @@ import torch
 from torchrl_caiac._kernels import cache_folder, machine, processor_slug
 from torchrl_caiac._whole_files import whole_file
 
-__all__ = ["GOOD", "addresses", "call", "call_with_rows", "library"]
+__all__ = ["GOOD", "addresses", "call", "call_with_rows", "check_rows", "library"]
 
 _logger = logging.getLogger("torchrl_caiac")
 
@@ -58,7 +58,20 @@ def call_with_rows(
     Raises:
         IndexError: a row is out of range.
     """
-    place = call(name, *args)
+    check_rows(call(name, *args), rows, length)
+
+
+def check_rows(place: int, rows: torch.Tensor | None, length: int) -> None:
+    """Raises if a function returned the place of a row that is out of range.
+
+    Args:
+        place (int): what it returned.
+        rows (torch.Tensor, optional): the rows, in their order.
+        length (int): how many there are.
+
+    Raises:
+        IndexError: a row is out of range.
+    """
     if place != GOOD:
         bad = place if rows is None else int(rows.flatten()[place])
         raise IndexError(f"row {bad} is out of range: there are {length} rows")
@@ -82,6 +95,7 @@ _ARGUMENTS: dict[str, list[Any]] = {
     "uninfluenced": [_I, _I, _I, _P, _P, _I, _P],
     "batch_fits": [_P],
     "swap_batch": [_P, ctypes.c_float, _P],
+    "window_goals": [_P, _P],
 }
 
 

@@ -1,7 +1,7 @@
 /* What sampling does to each row, without one operation of torch after the other.
  *
- * Each function gives the numbers of its reference in Python, to the bit; see
- * its Python modules. All tensors are contiguous and on the CPU. A function that
+ * Each function gives the numbers of its reference in Python, to the bit. The modules of
+ * this folder call them. All tensors are contiguous and on the CPU. A function that
  * is given rows returns the place of the first one that is out of range, or GOOD.
  */
 #include <stdint.h>
@@ -9,6 +9,7 @@
 
 #define GOOD -1
 #define NOT_FINITE -2
+#define NO_WINDOWS -3
 #define NEXT 0x9E3779B97F4A7C15u /* of _fingerprints */
 #define LINE 64 /* bytes of a cache line */
 #define AHEAD 8 /* how many rows before it is copied a donor is prefetched */
@@ -311,6 +312,67 @@ int64_t relabel_batch(const int64_t *number, const double *shares)
     for (int64_t r = 0; r < rows; r++)
         changed[r] = relabeled[r] | (flags[r] != 0);
     return bad;
+}
+
+/* WindowGoal, after its random numbers were drawn: the goals of the rows of windows, and
+ * the steps to them. The last strategy whose bound is at most the chance of a window is
+ * taken.
+ *
+ * Numbers: windows, rows in each, rows of the source, whether left is int32, strategies,
+ * bytes of a row of the source and of a goal, runs; the addresses of rows, left, chance,
+ * share, steps (each of these three or 0), source, starts and lengths of the runs,
+ * memory, goals and the steps to them; the strategies.
+ */
+int64_t window_goals(const int64_t *number, const float *bound)
+{
+    int64_t windows = number[0], window = number[1], length = number[2];
+    int64_t row_bytes = number[5], bytes = number[6];
+    const int64_t *rows = (const int64_t *)number[8], *kind = number + 19;
+    const void *left = (const void *)number[9];
+    const float *chance = (const float *)number[10];
+    const double *share = (const double *)number[11];
+    const int64_t *steps = (const int64_t *)number[12];
+    const char *source = (const char *)number[13];
+    const int64_t *run_start = (const int64_t *)number[14];
+    const int64_t *run_bytes = (const int64_t *)number[15];
+    int64_t *places = (int64_t *)number[16], *ahead = (int64_t *)number[18];
+    char *goals = (char *)number[17];
+    for (int64_t b = 0; b < windows; b++) {
+        const int64_t *row = rows + b * window;
+        int64_t first = row[0], most, offset = 0, is_broken = 0;
+        if (first < 0 || first >= length)
+            return b * window;
+        most = number[3] ? ((const int32_t *)left)[first] : ((const int64_t *)left)[first];
+        most -= window - 1;
+        for (int64_t w = 1; w < window; w++)
+            is_broken |= row[w] != first + w - (first + w < length ? 0 : length);
+        if (is_broken || most < 0)
+            return NO_WINDOWS;
+        for (int64_t k = 0; k < number[4]; k++) {
+            int64_t drawn = most; /* 0, the last row */
+            if (kind[k] == 1) /* uniform */
+                drawn = (int64_t)(share[b] * (double)(most + 1));
+            else if (kind[k] == 2 && steps[b] < most) /* geometric */
+                drawn = steps[b];
+            if (!chance || chance[b] >= bound[k])
+                offset = drawn;
+        }
+        places[b] = row[window - 1] + offset;
+        if (places[b] >= length)
+            places[b] -= length;
+        for (int64_t w = 0; w < window; w++)
+            *ahead++ = offset + window - 1 - w;
+    }
+    for (int64_t b = 0; b < windows; b++) {
+        const char *goal = goals;
+        if (b + AHEAD < windows)
+            __builtin_prefetch(source + places[b + AHEAD] * row_bytes + run_start[0]);
+        for (int64_t i = 0; i < number[7]; i++, goals += run_bytes[i - 1])
+            copy(goals, source + places[b] * row_bytes + run_start[i], run_bytes[i]);
+        for (int64_t w = 1; w < window; w++, goals += bytes)
+            copy(goals, goal, bytes);
+    }
+    return GOOD;
 }
 
 /* draws.uninfluenced: whether the scores of a window are at most the limits, of which

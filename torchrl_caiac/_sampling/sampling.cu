@@ -1,9 +1,9 @@
 // What sampling does to each row, on a CUDA device: the functions of sampling.c.
 //
-// Each kernel gives the numbers of its reference in Python, to the bit; see
-// its Python modules. All tensors are contiguous and on one device. A kernel has one argument,
-// a struct of 8-byte fields. Rows that are out of range stop the device, as an index of
-// torch does. Every kernel is right for any number of threads and blocks.
+// Each kernel gives the numbers of its reference in Python, to the bit. The modules of this
+// folder start them. All tensors are contiguous and on one device. A kernel has one
+// argument, a struct of 8-byte fields. Rows that are out of range stop the device, as an
+// index of torch does. Every kernel is right for any number of threads and blocks.
 
 typedef long long i64;
 typedef unsigned long long u64;

@@ -14,7 +14,8 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from torchrl_caiac import EntityLayout
 from torchrl_caiac._sampling import only_torch
 from torchrl_caiac.transforms import HindsightGoal, WindowGoal
-from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
+from torchrl_caiac.transforms.goals.future import FutureGoal
+from torchrl_caiac.transforms.goals.offsets import draw_goal_offset
 
 FLAT = EntityLayout(
     {"arm": [0], "cup": [3, 1]},

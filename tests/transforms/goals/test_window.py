@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from torchrl.data import (
 )
 
 from torchrl_caiac import EntityLayout
+from torchrl_caiac._sampling import is_native, only_torch
 from torchrl_caiac.transforms import CAIACTransform, TransformKeys, WindowGoal
 
 LAYOUT = EntityLayout(
@@ -181,6 +183,55 @@ def test_goals_are_later_states_of_the_same_trajectory(
     assert (rb.storage[:] == raw).all()
 
 
+@settings(max_examples=150, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 9), min_size=1, max_size=5),
+    window=st.integers(1, 4),
+    mixture=st.dictionaries(
+        st.sampled_from(["last", "uniform", "geometric"]),
+        st.floats(0, 3),
+        min_size=1,
+    ).filter(lambda mixture: sum(mixture.values()) > 0.01),
+    p=st.floats(0.05, 1.0),
+    seed=st.integers(0, 2**31),
+    dtype=st.sampled_from([torch.float32, torch.float64, torch.float16]),
+    size=st.integers(0, 20),
+    twisted=st.booleans(),
+)
+def test_goals_in_c_are_those_of_torch(
+    lengths, window, mixture, p, seed, dtype, size, twisted
+) -> None:
+    data = make([*lengths, window + 2])
+    data["next", "observation"] = data["next", "observation"].to(dtype)
+    layout = LAYOUT
+    if twisted:  # columns in several runs
+        layout = EntityLayout(
+            {"arm": [0], "cup": [1, 2]},
+            goal={"arm": [2], "cup": [1, 0]},
+            achieved={"arm": [0], "cup": [2, 1]},
+        )
+    storage = LazyTensorStorage(max(window + 2, len(data) - size))
+    rb = ReplayBuffer(storage=storage)
+    for begin in range(0, len(data), 3):  # perhaps a ring
+        rb.extend(data[begin : begin + 3])
+    generator = torch.Generator().manual_seed(seed)
+    goals = WindowGoal(layout, window, mixture=mixture, p=p, generator=generator)
+    _, trajectories = goals.stored(storage)
+    starts = (trajectories.left >= window - 1).nonzero()
+    first = starts[torch.randint(len(starts), (15,), generator=generator)]
+    rows = ((first + torch.arange(window)) % len(storage)).flatten()
+    assert is_native(rows)
+    batch, found = storage[:][rows], []
+    for context in (nullcontext(), only_torch()):
+        with context:
+            generator.manual_seed(seed)
+            goals.expand(rows, {}, storage)
+            found.append(goals(batch))
+    for key in ("desired_goal", ("hindsight", "steps")):
+        assert found[0][key].dtype == found[1][key].dtype
+        assert torch.equal(found[0][key], found[1][key])
+
+
 def test_last_respects_writes_and_the_cursor() -> None:
     goals = WindowGoal(LAYOUT, 2, mixture={"last": 1.0})
     rb = buffer(goals, [6], size=8, batch=4)
@@ -298,7 +349,7 @@ def test_without_a_draw_or_after_the_augmentation() -> None:
     with pytest.raises(RuntimeError, match="append WindowGoal before"):
         rb.sample()
     goals.expand(torch.tensor([0, 1]), {}, rb.storage)
-    with pytest.raises(RuntimeError, match="drawn for 1 windows"):
+    with pytest.raises(RuntimeError, match="drawn for 2 rows, but the batch has"):
         goals(rb.storage[:])
 
 
@@ -307,8 +358,11 @@ def test_windows_that_do_not_fit() -> None:
     storage = buffer(goals, [5, 5]).storage
     with pytest.raises(ValueError, match="4 rows, not a multiple of the window 3"):
         goals.expand(torch.arange(4), {}, storage)
-    for rows in ([3, 4, 5], [0, 2, 4], [2, 1, 0]):
+    for rows in ([3, 4, 5], [0, 2, 4], [2, 1, 0], [4, 5, 6], [0, 1, 99], [0, -9, 2]):
         with pytest.raises(ValueError, match="not consecutive rows of one traj"):
+            goals.expand(torch.tensor(rows), {}, storage)
+    for rows in ([10, 11, 12], [-1, 0, 1]):
+        with pytest.raises(IndexError, match="out of range"):
             goals.expand(torch.tensor(rows), {}, storage)
     with pytest.raises(RuntimeError, match="sufficient length"):
         buffer(WindowGoal(LAYOUT, 6), [5, 5]).sample()

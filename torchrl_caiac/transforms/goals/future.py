@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -14,7 +13,6 @@ from torchrl.data.replay_buffers import SampleUnit
 
 from torchrl_caiac._buffer_transform import RandomTransform
 from torchrl_caiac._keys import join, missing_key, path
-from torchrl_caiac._random import draw_below, draw_numbers
 from torchrl_caiac._sampling import is_native, read_ahead, read_columns
 from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
@@ -24,98 +22,7 @@ from torchrl_caiac.transforms.checks import check_generator, check_layout
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 
-__all__ = ["FutureGoal", "draw_goal_offset", "draw_steps"]
-
-
-def draw_goal_offset(
-    remaining: torch.Tensor,
-    mixture: Mapping[str, float],
-    *,
-    p: float = 0.3,
-    generator: torch.Generator | None = None,
-) -> torch.Tensor:
-    """Draws the number of rows from each window to its goal.
-
-    Offset 0 is the window's last row, whose next state is the first one after the
-    window. Three strategies are mixed, window by window: ``last`` takes the
-    trajectory's last row, ``uniform`` any row from the window's last one on, and
-    ``geometric`` the state ``k >= 1`` steps after the window's last one with
-    probability ``p * (1 - p) ** (k - 1)``, or the last one if the trajectory ends
-    before it.
-
-    Args:
-        remaining (torch.Tensor): int64 ``[*]``, rows of the trajectory after the
-            window.
-        mixture (mapping of str to float): the weight of each strategy.
-
-    Keyword Args:
-        p (float): the parameter of ``geometric``, in (0, 1]. Defaults to 0.3.
-        generator (torch.Generator, optional): source of randomness.
-
-    Returns:
-        torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.transforms.goals.future import draw_goal_offset
-        >>> draw_goal_offset(torch.tensor([4, 0]), {"last": 1.0})
-        tensor([4, 0])
-    """
-    weights = {name: weight for name, weight in mixture.items() if weight > 0}
-    device, offset = remaining.device, remaining
-    chance = None
-    if len(weights) > 1:
-        chance = draw_numbers(
-            torch.rand, remaining.shape, device=device, generator=generator
-        )
-    below, total = 0.0, sum(weights.values())
-    for name, weight in weights.items():
-        drawn = remaining
-        if name == "uniform":
-            drawn = draw_below(remaining + 1, generator=generator)
-        elif name == "geometric":
-            drawn = torch.minimum(
-                draw_steps(remaining.shape, p, device, generator), remaining
-            )
-        if chance is None or below == 0.0:
-            offset = drawn
-        else:
-            offset = torch.where(chance >= below / total, drawn, offset)
-        below += weight
-    return offset
-
-
-def draw_steps(
-    shape: torch.Size,
-    p: float,
-    device: torch.device,
-    generator: torch.Generator | None = None,
-) -> torch.Tensor:
-    """Draws the number of failed trials before the first success.
-
-    Args:
-        shape (torch.Size): the shape of the result.
-        p (float): the probability of success, above 0.
-        device (torch.device): the device of the result.
-        generator (torch.Generator, optional): source of randomness.
-
-    Returns:
-        torch.Tensor: int64, of this shape.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_caiac.transforms.goals.future import draw_steps
-        >>> draw_steps((2,), 1.0, torch.device("cpu"))
-        tensor([0, 0])
-    """
-
-    def draw(*, generator: Any, **kwargs: Any) -> torch.Tensor:
-        trials = torch.empty(shape, dtype=torch.int64, **kwargs)
-        return trials.geometric_(p, generator=generator) - 1
-
-    if p >= 1.0:
-        return torch.zeros(shape, dtype=torch.int64, device=device)
-    return draw_numbers(draw, device=device, generator=generator)
+__all__ = ["FutureGoal"]
 
 
 class FutureGoal(RandomTransform, SampleUnit):

@@ -17,11 +17,8 @@ from torchrl_caiac._torchrl import leaf_of
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_number
-from torchrl_caiac.transforms.goals.future import (
-    FutureGoal,
-    draw_goal_offset,
-    draw_steps,
-)
+from torchrl_caiac.transforms.goals.future import FutureGoal
+from torchrl_caiac.transforms.goals.offsets import draw_goal_offset, draw_steps
 from torchrl_caiac.transforms.goals.repeated_relabel import RepeatedRelabel, unexplained
 from torchrl_caiac.transforms.indexing import window_starts
 from torchrl_caiac.transforms.keys import TransformKeys

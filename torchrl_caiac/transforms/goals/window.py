@@ -12,16 +12,24 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._batches import with_leaves
 from torchrl_caiac._keys import path
+from torchrl_caiac._sampling import is_native, window_goals
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_window
-from torchrl_caiac.transforms.goals.future import FutureGoal, draw_goal_offset
+from torchrl_caiac.transforms.goals.future import FutureGoal
+from torchrl_caiac.transforms.goals.offsets import (
+    GoalNumbers,
+    draw_goal_numbers,
+    draw_goal_offset,
+    goal_offset,
+    strategy_bounds,
+)
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = ["WindowGoal"]
 
-_STRATEGIES = ("last", "uniform", "geometric")
+_STRATEGIES = ("last", "uniform", "geometric")  # numbered as in sampling.c
 
 
 class WindowGoal(FutureGoal):
@@ -49,8 +57,8 @@ class WindowGoal(FutureGoal):
     Keyword Args:
         mixture (mapping of str to float, optional): the weights of the strategies
             ``"last"``, ``"uniform"`` and ``"geometric"``, see
-            :func:`~torchrl_caiac.transforms.goals.future.draw_goal_offset`. Defaults
-            to half ``"last"``, half ``"geometric"``.
+            :func:`~torchrl_caiac.transforms.goals.offsets.draw_goal_offset`.
+            Defaults to half ``"last"``, half ``"geometric"``.
         p (float): the parameter of ``"geometric"``. Defaults to 0.3.
         generator (torch.Generator, optional): source of randomness. Defaults to
             torch's default generator.
@@ -177,20 +185,77 @@ class WindowGoal(FutureGoal):
             )
         data, trajectories = self.stored(storage)
         rows = rows.to(trajectories.device)
+        numbers = draw_goal_numbers(
+            torch.Size([rows.shape[0] // self.window]),
+            self.mixture,
+            p=self.p,
+            device=rows.device,
+            generator=self.generator,
+        )
+        goals = self._read_at_once(data, trajectories, rows, numbers)
+        if goals is None:
+            goals = self._read(data, trajectories, rows, numbers)
+        self.keep_goals(goals)
+        return index, info
+
+    def _read_at_once(
+        self,
+        data: TensorDictBase,
+        trajectories: TrajectoryIndex,
+        rows: torch.Tensor,
+        numbers: GoalNumbers,
+    ) -> dict[NestedKey, torch.Tensor] | None:
+        """Reads goals by one function of C; ``None`` where it cannot."""
+        layout, left = self.layout, trajectories.left
+        if (
+            not layout.is_flat
+            or trajectories.order is not None
+            or rows.dtype is not torch.int64
+            or rows.device.type != "cpu"
+            or LateCheck.needed(rows.device)  # it raises at once
+            or left.dtype not in (torch.int32, torch.int64)
+        ):
+            return None
+        source = self.flat_source(data)
+        drawn = [x for x in numbers if x is not None]
+        sources = [source, left]
+        if len(left) > len(source) or not is_native(rows, *drawn, sources=sources):
+            return None
+        bounds = [
+            (_STRATEGIES.index(name), least)
+            for name, least in strategy_bounds(self.mixture)
+        ]
+        columns = self.goal_columns
+        found = window_goals(rows, self.window, left, bounds, numbers, source, columns)
+        if found is None:
+            return None
+        return {layout.desired_goal_key: found[0], self.keys.goal_steps: found[1]}
+
+    def _read(
+        self,
+        data: TensorDictBase,
+        trajectories: TrajectoryIndex,
+        rows: torch.Tensor,
+        numbers: GoalNumbers,
+    ) -> dict[NestedKey, torch.Tensor]:
+        """Checks windows, and reads the goals of their rows, and the steps to them."""
         windows = rows.view(-1, self.window)
         first, last = windows[:, 0], windows[:, -1]
         remaining = trajectories.remaining(first) - (self.window - 1)
         if self.window > 1:
             self._check_windows(windows, remaining, trajectories)
         # Below zero only if an error is raised later.
-        offset = draw_goal_offset(
-            remaining.clamp_min(0), self.mixture, p=self.p, generator=self.generator
-        )
+        offset = goal_offset(remaining.clamp_min(0), self.mixture, numbers)
         goals = self.read_goals(data, trajectories.later(last, offset))
-        # Of the last row of each window.
-        steps = offset.to(last.device).unsqueeze(-1)
-        self.keep_goals({**goals, self.keys.goal_steps: steps})
-        return index, info
+        steps = offset.unsqueeze(-1)
+        if self.window > 1:
+            ahead = torch.arange(self.window - 1, -1, -1, device=steps.device)
+            steps = (steps + ahead).reshape(-1, 1)
+            goals = {
+                key: goal.repeat_interleave(self.window, 0)
+                for key, goal in goals.items()
+            }
+        return {**goals, self.keys.goal_steps: steps}
 
     def _check_windows(
         self,
@@ -275,27 +340,19 @@ class WindowGoal(FutureGoal):
                 "follow the swap: append WindowGoal before the augmentation"
             )
         leaves: dict[NestedKey, torch.Tensor] = {}
-        device = tensordict.device
-        steps = goals.pop(self.keys.goal_steps)
         for key, goal in goals.items():
-            if goal.shape[0] * self.window != tensordict.shape[0]:
+            if goal.shape[0] != tensordict.shape[0]:
                 raise RuntimeError(
-                    f"goals were drawn for {goal.shape[0]} windows of {self.window} "
-                    f"rows, but the batch has {tensordict.shape[0]} rows: append "
-                    "WindowGoal first, before transforms that change the batch size"
+                    f"goals were drawn for {goal.shape[0]} rows, but the batch has "
+                    f"{tensordict.shape[0]}: append WindowGoal first, before "
+                    "transforms that change the batch size"
                 )
-            rows = goal if device is None else goal.to(device)
-            if self.window > 1:
-                rows = rows.unsqueeze(1).expand(-1, self.window, *goal.shape[1:])
-                rows = rows.flatten(0, 1)
-            leaves[key] = rows
-            after = self.layout.next(key)
-            if tensordict.get(after, None) is not None:
-                leaves[after] = rows
-        if self.window > 1:
-            ahead = torch.arange(self.window - 1, -1, -1, device=steps.device)
-            steps = (steps + ahead).reshape(-1, 1)
-        leaves[self.keys.goal_steps] = steps if device is None else steps.to(device)
+            device = tensordict.device
+            leaves[key] = goal if device is None else goal.to(device)
+            if key != self.keys.goal_steps:
+                after = self.layout.next(key)
+                if tensordict.get(after, None) is not None:
+                    leaves[after] = leaves[key]
         return with_leaves(tensordict, leaves)
 
     def extra_repr(self) -> str:

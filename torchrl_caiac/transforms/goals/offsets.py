@@ -1,0 +1,209 @@
+"""Random numbers of rows between a window and its goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+
+from torchrl_caiac._random import draw_numbers
+
+__all__ = [
+    "GoalNumbers",
+    "draw_goal_numbers",
+    "draw_goal_offset",
+    "draw_steps",
+    "goal_offset",
+    "strategy_bounds",
+]
+
+
+class GoalNumbers(NamedTuple):
+    """The random numbers that goals of windows are drawn with.
+
+    Attributes:
+        chance (torch.Tensor, optional): float32 ``[*]``, below 1, which strategy each
+            window has; ``None`` if there is one.
+        share (torch.Tensor, optional): float64 ``[*]``, below 1, of ``uniform``.
+        steps (torch.Tensor, optional): int64 ``[*]``, of ``geometric``.
+    """
+
+    chance: torch.Tensor | None
+    share: torch.Tensor | None
+    steps: torch.Tensor | None
+
+
+def draw_goal_offset(
+    remaining: torch.Tensor,
+    mixture: Mapping[str, float],
+    *,
+    p: float = 0.3,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Draws the number of rows from each window to its goal.
+
+    Offset 0 is the window's last row, whose next state is the first one after the
+    window. Three strategies are mixed, window by window: ``last`` takes the
+    trajectory's last row, ``uniform`` any row from the window's last one on, and
+    ``geometric`` the state ``k >= 1`` steps after the window's last one with
+    probability ``p * (1 - p) ** (k - 1)``, or the last one if the trajectory ends
+    before it.
+
+    Args:
+        remaining (torch.Tensor): int64 ``[*]``, rows of the trajectory after the
+            window.
+        mixture (mapping of str to float): the weight of each strategy.
+
+    Keyword Args:
+        p (float): the parameter of ``geometric``, in (0, 1]. Defaults to 0.3.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.goals.offsets import draw_goal_offset
+        >>> draw_goal_offset(torch.tensor([4, 0]), {"last": 1.0})
+        tensor([4, 0])
+    """
+    numbers = draw_goal_numbers(
+        remaining.shape, mixture, p=p, device=remaining.device, generator=generator
+    )
+    return goal_offset(remaining, mixture, numbers)
+
+
+def draw_goal_numbers(
+    shape: torch.Size,
+    mixture: Mapping[str, float],
+    *,
+    p: float,
+    device: torch.device,
+    generator: torch.Generator | None = None,
+) -> GoalNumbers:
+    """Draws the random numbers of :func:`draw_goal_offset`.
+
+    Args:
+        shape (torch.Size): the shape of the windows.
+        mixture (mapping of str to float): the weight of each strategy.
+
+    Keyword Args:
+        p (float): the parameter of ``geometric``, in (0, 1].
+        device (torch.device): the device of the numbers.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        GoalNumbers: the numbers that the strategies need.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.goals.offsets import draw_goal_numbers
+        >>> shape, device = torch.Size([2]), torch.device("cpu")
+        >>> draw_goal_numbers(shape, {"last": 1.0}, p=0.3, device=device)
+        GoalNumbers(chance=None, share=None, steps=None)
+    """
+    names = [name for name, weight in mixture.items() if weight > 0]
+    drawn: dict[str, torch.Tensor] = {}
+    own: dict[str, Any] = {"device": device, "generator": generator}
+    if len(names) > 1:
+        drawn["chance"] = draw_numbers(torch.rand, shape, **own)
+    for name in names:  # in the order of the mixture
+        if name == "uniform":
+            drawn["share"] = draw_numbers(torch.rand, shape, dtype=torch.float64, **own)
+        elif name == "geometric":
+            drawn["steps"] = draw_steps(shape, p, **own)
+    return GoalNumbers(*map(drawn.get, GoalNumbers._fields))
+
+
+def goal_offset(
+    remaining: torch.Tensor, mixture: Mapping[str, float], numbers: GoalNumbers
+) -> torch.Tensor:
+    """Returns the number of rows from each window to its goal.
+
+    Args:
+        remaining (torch.Tensor): int64 ``[*]``, rows of the trajectory after the
+            window.
+        mixture (mapping of str to float): the weight of each strategy.
+        numbers (GoalNumbers): of :func:`draw_goal_numbers`, for the same mixture.
+
+    Returns:
+        torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.goals.offsets import GoalNumbers, goal_offset
+        >>> numbers = GoalNumbers(None, None, torch.tensor([1, 1]))
+        >>> goal_offset(torch.tensor([4, 0]), {"geometric": 1.0}, numbers)
+        tensor([1, 0])
+    """
+    offset = remaining
+    for name, least in strategy_bounds(mixture):
+        drawn = remaining
+        if name == "uniform":
+            assert numbers.share is not None
+            drawn = (numbers.share * (remaining + 1)).long()
+        elif name == "geometric":
+            assert numbers.steps is not None
+            drawn = torch.minimum(numbers.steps, remaining)
+        if numbers.chance is None or least == 0.0:
+            offset = drawn
+        else:
+            offset = torch.where(numbers.chance >= least, drawn, offset)
+    return offset
+
+
+def strategy_bounds(mixture: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Returns each strategy with the least ``chance`` for which it is taken.
+
+    Args:
+        mixture (mapping of str to float): the weight of each strategy.
+
+    Returns:
+        list of tuple: strategies and bounds, ascending from 0.
+
+    Examples:
+        >>> from torchrl_caiac.transforms.goals.offsets import strategy_bounds
+        >>> strategy_bounds({"last": 1.0, "uniform": 0.0, "geometric": 3.0})
+        [('last', 0.0), ('geometric', 0.25)]
+    """
+    weights = {name: weight for name, weight in mixture.items() if weight > 0}
+    total, below = sum(weights.values()), 0.0
+    found = []
+    for name, weight in weights.items():
+        found.append((name, below / total))
+        below += weight
+    return found
+
+
+def draw_steps(
+    shape: torch.Size,
+    p: float,
+    device: torch.device,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Draws the number of failed trials before the first success.
+
+    Args:
+        shape (torch.Size): the shape of the result.
+        p (float): the probability of success, above 0.
+        device (torch.device): the device of the result.
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        torch.Tensor: int64, of this shape.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.goals.offsets import draw_steps
+        >>> draw_steps((2,), 1.0, torch.device("cpu"))
+        tensor([0, 0])
+    """
+
+    def draw(*, generator: Any, **kwargs: Any) -> torch.Tensor:
+        trials = torch.empty(shape, dtype=torch.int64, **kwargs)
+        return trials.geometric_(p, generator=generator) - 1
+
+    if p >= 1.0:
+        return torch.zeros(shape, dtype=torch.int64, device=device)
+    return draw_numbers(draw, device=device, generator=generator)
