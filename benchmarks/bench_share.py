@@ -3,7 +3,7 @@
 Run with ``pytest benchmarks/bench_share.py --benchmark-only --ratios=<folder>``, in
 ``make bench`` too. A TD3 step is that of ``bench_td3`` (half of two critic updates, one
 of the policy and one of the targets) on transitions of Fetch-Push from 1 M rows; the
-example samples four batches at once, which is measured too. Both buffers have the
+examples sample four batches at once, which is measured too. Both buffers have the
 storage of ``offline_buffer``, as the examples have. A step of LMP is that of
 ``bench_lmp``, on windows of the kitchen from 6,000 rows. The share is the time of
 ``rb.sample()`` with swaps and goals, in that of sample and step together. The second
@@ -77,7 +77,7 @@ def bench_td3_share(
 def bench_lmp_share(
     benchmark: Any, judge: Any, device: torch.device, windows: int, window: int
 ) -> None:
-    """Windows with goals."""
+    """Windows with goals: one batch in a sample, and four, which are split."""
     buffer = make_buffer(windows, window, device, swap=True)
     plain = ReplayBuffer(
         storage=buffer.storage,
@@ -85,13 +85,22 @@ def bench_lmp_share(
         batch_size=windows * window,
     )
     step, batch = make_step(window, device), buffer.sample()
+    size = windows * window
     times = seconds(
-        {"plain": plain.sample, "sample": buffer.sample, "step": lambda: step(batch)},
+        {
+            "plain": plain.sample,
+            "one": buffer.sample,
+            "plain of four": lambda: plain.sample(4 * size),
+            "of four": lambda: buffer.sample(4 * size),
+            "step": lambda: step(batch),
+        },
         rounds=30,
         warmup=25,
     )
-    label = f"LMP, {windows} windows of {window}"
-    shares(judge, label, times["plain"], times["sample"], times["step"], 0.1)
+    for what, number in (("one", 1), ("of four", 4)):
+        label = f"LMP, {windows} windows of {window}, {what}"
+        before = times["plain" if number == 1 else "plain of four"] / number
+        shares(judge, label, before, times[what] / number, times["step"], 0.1)
     benchmark.pedantic(buffer.sample, rounds=20)
 
 

@@ -113,6 +113,26 @@ class Learner(ABC):
             )
         return rows.select(*keys).clone()
 
+    @property
+    def at_once(self) -> int:
+        """The number of batches in one sample, ``batches_at_once``, by default 1."""
+        return int(self.settings.get("batches_at_once") or 1)
+
+    def check_strides(self) -> None:
+        """Raises if a run could stop in the middle of a sample."""
+        for name in ("steps", "checkpoint_every"):
+            if self.settings[name] % self.at_once:
+                raise ValueError(
+                    f"learner.{name} is {self.settings[name]}, expected a multiple of "
+                    f"learner.batches_at_once, {self.at_once}: a run could not resume "
+                    "in the middle of a sample"
+                )
+
+    def split(self, sample: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Yields the batches of one sample."""
+        # In strides: the last rows of a sample, and so of each, are counterfactual.
+        yield from (sample[first :: self.at_once] for first in range(self.at_once))
+
     def counterfactuals(self, **options: Any) -> Transform | None:
         """Returns the method's transform with the settings of the environment.
 

@@ -110,12 +110,11 @@ class DiffusionBC(BC):
     def batches(self) -> Iterator[TensorDictBase]:
         """Yields the first rows of windows, with the actions of the whole windows."""
         chunks = ActionChunkTransform(self.window, chunk_key="chunk")
-        at_once = self.settings.batches_at_once
         while True:
             windows = self.rb.sample().reshape(-1, self.window)
             actions = chunks(windows.select("action", ("next", "done")))["chunk"]
             rows = windows[:, 0].set("chunk", actions[:, 0].flatten(-2))
-            yield from (rows[first::at_once] for first in range(at_once))
+            yield from self.split(rows)
 
     def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
         """Takes one step of Adam."""

@@ -29,17 +29,6 @@ class GoalConditioned(Learner):
     rb: ReplayBuffer
     actor: GoalConditionedActor
 
-    def check_strides(self) -> None:
-        """Raises if a run could stop in the middle of a sample."""
-        settings = self.settings
-        for name in ("steps", "checkpoint_every"):
-            if settings[name] % settings.batches_at_once:
-                raise ValueError(
-                    f"learner.{name} is {settings[name]}, expected a multiple of "
-                    f"learner.batches_at_once, {settings.batches_at_once}: a run could "
-                    "not resume in the middle of a sample"
-                )
-
     def start(self, rows: TensorDictBase, seed: int) -> GoalFeatures:
         """Makes the buffer; returns features with the statistics of some batches.
 
@@ -87,15 +76,12 @@ class GoalConditioned(Learner):
     @property
     def rows_at_once(self) -> int:
         """The number of transitions in one sample."""
-        return int(self.settings.batch_size * self.settings.batches_at_once)
+        return int(self.settings.batch_size * self.at_once)
 
     def batches(self) -> Iterator[TensorDictBase]:
         """Yields batches, several from one sample, which saves time."""
-        at_once = self.settings.batches_at_once
         while True:
-            rows = self.rb.sample()
-            # In strides: the last rows of a sample, and so of each, are counterfactual.
-            yield from (rows[first::at_once] for first in range(at_once))
+            yield from self.split(self.rb.sample())
 
     def policy_state(self) -> dict[str, Any]:
         """Returns the state of the policy."""

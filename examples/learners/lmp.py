@@ -41,7 +41,7 @@ class LMP(Learner):
         return imitation_buffer(
             self,
             rows,
-            batch_size=settings.windows * settings.window,
+            batch_size=settings.windows * self.at_once * settings.window,
             window=settings.window,
             goals=goals,
         )
@@ -49,6 +49,7 @@ class LMP(Learner):
     def setup(self, rows: TensorDictBase, seed: int) -> None:
         """Makes the model, with the statistics of the rows."""
         settings = self.settings
+        self.check_strides()
         torch.manual_seed(seed)
         self.model = self.make_model()
         goals = self.environment.layout.achieved_goal(rows, next=True)
@@ -96,13 +97,13 @@ class LMP(Learner):
         )
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields batches of windows, ``[windows * window]``."""
+        """Yields batches of windows, ``[windows, window]``."""
         while True:
-            yield self.rb.sample()
+            yield from self.split(self.rb.sample().reshape(-1, self.settings.window))
 
     def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:
         """Takes one step of Adam."""
-        losses = self.loss_module(batch.reshape(-1, self.settings.window))
+        losses = self.loss_module(batch)
         loss = losses["loss_reconstruction"] + losses["loss_kl"]
         self.optimizer.zero_grad()
         loss.backward()

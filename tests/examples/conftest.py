@@ -67,6 +67,7 @@ SMALL_LEARNER = {
     "lmp": {
         "steps": 12,
         "windows": 16,
+        "batches_at_once": 2,
         "hidden_size": 16,
         "checkpoint_every": 6,
         "log_every": 6,
