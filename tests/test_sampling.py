@@ -298,6 +298,20 @@ def test_columns_of_rows(
     assert torch.equal(found, wanted[:, columns])
 
 
+@pytest.mark.parametrize("rows", [None, [3, 2, 2, 0]])
+@DEVICES
+def test_fingerprints_in_a_column(device: str, rows: list[int] | None) -> None:
+    td = TensorDict({"x": torch.arange(8.0).view(4, 2)}, [4]).to(device)
+    known = fingerprint(state_hash(td, ["x"]), None, ["a"], 0).unsqueeze(1)
+    td["x"][2] = 9.0
+    wanted, picked = td["x"][:, 0] != 9.0, None
+    if rows is not None:
+        picked = torch.tensor(rows, device=device)
+        wanted = wanted[picked]
+    for one in both(lambda: matches(td, known, ["x"], [], ["a"], picked), device):
+        assert torch.equal(one, wanted)
+
+
 @pytest.mark.parametrize("row", [-1, -2, 3, 1 << 40, (1 << 63) - 1, -(1 << 63)])
 def test_rows_out_of_range(row: int) -> None:
     state, rows = torch.zeros(3, 2), torch.tensor([0, row])

@@ -143,7 +143,7 @@ def matches(
 
     Args:
         td (TensorDictBase): the rows, ``[T]``.
-        known (torch.Tensor): their fingerprints, int64 ``[T]``.
+        known (torch.Tensor): their fingerprints, int64 ``[T]`` or ``[T, 1]``.
         keys (sequence of NestedKey): the entries of states.
         next_keys (sequence of NestedKey): the entries of next states.
         names (sequence of str): the entities, in the order of the scores.
@@ -153,6 +153,7 @@ def matches(
     Returns:
         torch.Tensor: bool ``[B]``.
     """
+    known = known.reshape(-1)
     found = _matched(td, known, keys, next_keys, names, rows)
     if found is not None:
         return found
@@ -227,14 +228,14 @@ def is_fingerprint_of(
     names: Sequence[str],
 ) -> torch.Tensor:
     """Returns which rows still have the states of their fingerprints, bool ``[B]``."""
-    return (known - _joint(state, after)) >> 32 == upper_half(tuple(names))
+    return (known.reshape(-1) - _joint(state, after)) >> 32 == upper_half(tuple(names))
 
 
 def settings_of(
     known: torch.Tensor, state: torch.Tensor, after: torch.Tensor | None
 ) -> torch.Tensor:
     """Returns the settings of rows, int64 ``[B]``, meaningless where states differ."""
-    return (known - _joint(state, after)) & 0xFFFFFFFF
+    return (known.reshape(-1) - _joint(state, after)) & 0xFFFFFFFF
 
 
 def rows_with_fingerprints(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from tensordict import LazyStackedTensorDict, TensorClass, TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_caiac import CAIACTransform, EntityLayout
+from torchrl_caiac._sampling import only_torch
 from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms.draws import SwapDraw
 from torchrl_caiac.transforms.swap import SwapPlanner, apply_swap
@@ -254,6 +256,21 @@ def test_any_windows_of_a_batch_are_replaced(
             of_cup = layout is NESTED or column in (1, 2)
             assert torch.equal(value[:, column], cup if of_cup else name)
     assert (td == before).all()
+
+
+@pytest.mark.parametrize("row", [-1, 3, 1 << 40, (1 << 63) - 1, -(1 << 63)])
+@pytest.mark.parametrize("has_sources", [False, True])
+@pytest.mark.parametrize("in_torch", [False, True])
+def test_donors_out_of_range(row: int, has_sources: bool, in_torch: bool) -> None:
+    td = TensorDict({"observation": torch.zeros(3, 2)}, [3])
+    td["next"] = td.clone()
+    plan, values = SwapPlanner(EntityLayout({"arm": [0], "cup": [1]}))(td)
+    donors = torch.tensor([[0, 0], [0, row]])
+    draw = SwapDraw(donors, torch.ones_like(donors).bool(), torch.zeros(2).long())
+    sources = [values[leaf.place] for leaf in plan.leaves] if has_sources else None
+    context = only_torch() if in_torch else nullcontext()
+    with context, pytest.raises(IndexError, match="out of range"):
+        apply_swap(td, plan, values, draw, sources=sources)
 
 
 def test_places_in_storages_of_more_than_two_billion_values() -> None:

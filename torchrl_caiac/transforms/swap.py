@@ -394,7 +394,8 @@ def apply_swap(
     if not has_own:
         length = max(map(len, sources or ()), default=0)
     if length * max((leaf.width for leaf in plan.leaves), default=0) < 1 << 31:
-        rows = rows.int()  # half as much to write and to read
+        # Half as much to write and to read. Rows that are out of range stay so.
+        rows = rows.clamp(-1, length).int()
     places: dict[int, torch.Tensor] = {}
     masks: dict[tuple[int, int], torch.Tensor] = {}
     leaves: dict[NestedKey, torch.Tensor] = {}
