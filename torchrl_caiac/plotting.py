@@ -298,7 +298,7 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
     experiments = list(dict.fromkeys(row["experiment"] for row in shown))
     estimators = list(dict.fromkeys(row["estimator"] for row in shown))
     width = 0.8 / len(estimators)
-    figure = new_figure(10.0, 5.0)
+    figure = new_figure(max(10.0, 2.0 * len(experiments)), 5.0)
     grid = figure.subplots(2, 3).ravel()
     grid[-1].remove()
     for axes, (title, columns, kind) in zip(grid, _PANELS, strict=False):
@@ -317,7 +317,7 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 **_fill(n),
             )
         axes.set_title(title, fontsize=9)
-        labels = [textwrap.fill(name_label(e), 10) for e in experiments]
+        labels = [textwrap.fill(name_label(e), 8) for e in experiments]
         axes.set_xticks(range(len(experiments)), labels, fontsize=8)
         if kind == "log" and axes.patches:
             axes.set_yscale("log")
