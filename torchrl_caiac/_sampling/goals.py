@@ -9,7 +9,12 @@ from typing import NamedTuple
 import torch
 
 from torchrl_caiac._sampling import on_cuda as cuda
-from torchrl_caiac._sampling.on_cpu import call, call_with_rows, check_rows
+from torchrl_caiac._sampling.on_cpu import (
+    call,
+    call_with_rows,
+    check_rows,
+    int64_array,
+)
 from torchrl_caiac._sampling.rows import column_runs, device_numbers
 
 __all__ = [
@@ -183,10 +188,9 @@ def relabel_batch(
         *map(cuda.address, (*places, runs.start, runs.length, memory)),
         *map(cuda.address, (goals, achieved, relabeled, changed)),
     ]
-    given = (ctypes.c_int64 * len(table))(*table)
     call_with_rows(
         *("relabel_batch", memory[1], (2 if future is None else 3) * rows),
-        *(given, (ctypes.c_double * 3)(*shares)),
+        *(int64_array(table), (ctypes.c_double * 3)(*shares)),
     )
     return RelabeledBatch(goals, achieved, relabeled, changed, memory[1])
 
@@ -235,7 +239,7 @@ def window_goals(
         *(kind for kind, _ in bounds),
     ]
     least = (ctypes.c_float * len(bounds))(*(least for _, least in bounds))
-    place = call("window_goals", (ctypes.c_int64 * len(table))(*table), least)
+    place = call("window_goals", int64_array(table), least)
     if place == _NO_WINDOWS:
         return None
     check_rows(place, rows, length)

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,15 @@ import torch
 from torchrl_caiac._kernels import cache_folder, machine, processor_slug
 from torchrl_caiac._whole_files import whole_file
 
-__all__ = ["GOOD", "addresses", "call", "call_with_rows", "check_rows", "library"]
+__all__ = [
+    "GOOD",
+    "addresses",
+    "call",
+    "call_with_rows",
+    "check_rows",
+    "int64_array",
+    "library",
+]
 
 _logger = logging.getLogger("torchrl_caiac")
 
@@ -33,6 +41,16 @@ GOOD = -1  # what functions in C return if no row is out of range
 def addresses(tensors: Sequence[torch.Tensor]) -> Any:
     """Returns the addresses of the numbers of tensors, an array in C."""
     return (ctypes.c_void_p * len(tensors))(*(x.data_ptr() for x in tensors))
+
+
+def int64_array(numbers: Sequence[int]) -> Any:
+    """Returns an array in C."""
+    return _array_type(len(numbers))(*numbers)
+
+
+@lru_cache(maxsize=64)
+def _array_type(length: int) -> Any:  # ctypes would create some of them again and again
+    return ctypes.c_int64 * length
 
 
 def call(name: str, *args: Any) -> Any:

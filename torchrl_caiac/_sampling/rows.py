@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
 
 from torchrl_caiac._sampling import on_cuda as cuda
-from torchrl_caiac._sampling.on_cpu import GOOD, addresses, call, call_with_rows
+from torchrl_caiac._sampling.on_cpu import (
+    GOOD,
+    addresses,
+    call,
+    call_with_rows,
+    int64_array,
+)
 from torchrl_caiac._sampling.runs import Runs
 
 __all__ = [
@@ -93,7 +98,7 @@ def state_matches(
         rows,
         len(leaves),
         addresses(leaves),
-        (ctypes.c_int64 * len(leaves))(*(leaf.shape[1] for leaf in leaves)),
+        int64_array([leaf.shape[1] for leaf in leaves]),
         addresses(weights),
         known,
         upper,
@@ -125,7 +130,7 @@ def gather_rows(
         table += [source.data_ptr(), out.data_ptr(), source.nbytes // length]
     call_with_rows(
         *("gather_rows", rows, length, count, length, rows),
-        *(len(found), (ctypes.c_int64 * len(table))(*table)),
+        *(len(found), int64_array(table)),
     )
     return found
 
@@ -334,7 +339,7 @@ def batch_fits(
         numbers += [here.data_ptr(), there.data_ptr(), weights.data_ptr()]
         numbers.append(here.shape[1])
     numbers += [flag.data_ptr() for flag in flags]
-    return bool(call("batch_fits", (ctypes.c_int64 * len(numbers))(*numbers)))
+    return bool(call("batch_fits", int64_array(numbers)))
 
 
 def rows_fit(

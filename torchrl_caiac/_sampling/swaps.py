@@ -10,7 +10,13 @@ import torch
 
 from torchrl_caiac._sampling import on_cuda as cuda
 from torchrl_caiac._sampling.draws import batch_donors
-from torchrl_caiac._sampling.on_cpu import GOOD, addresses, call, call_with_rows
+from torchrl_caiac._sampling.on_cpu import (
+    GOOD,
+    addresses,
+    call,
+    call_with_rows,
+    int64_array,
+)
 from torchrl_caiac._sampling.rows import device_numbers
 from torchrl_caiac._sampling.runs import Runs
 
@@ -65,7 +71,7 @@ def swap_rows(
         donors,
         swapped,
         len(leaves),
-        (ctypes.c_int64 * len(table))(*table),
+        int64_array(table),
     )
     return outs
 
@@ -199,7 +205,7 @@ def swap_batch(
     for state in states:
         tensor = outs[state] if isinstance(state, int) else state
         table += [tensor.data_ptr(), tensor.numel()]
-    given, lost = (ctypes.c_int64 * len(table))(*table), ctypes.c_int64()
+    given, lost = int64_array(table), ctypes.c_int64()
     found = call("swap_batch", given, swap_prob, ctypes.byref(lost))
     if found >= 0:
         row = int(numbers[windows + found])
@@ -215,7 +221,7 @@ def _storage_numbers(donors: DonorRows) -> tuple[Any, ...]:
     weights = [weight for _, weight in donors.states]
     kept = (
         addresses(values),
-        (ctypes.c_int64 * len(values))(*(leaf.shape[1] for leaf in values)),
+        int64_array([leaf.shape[1] for leaf in values]),
         addresses(weights),
     )
     known, starts = donors.known, donors.starts
@@ -225,7 +231,7 @@ def _storage_numbers(donors: DonorRows) -> tuple[Any, ...]:
         *(0 if known is None else known.shape[0], donors.upper, len(values)),
         *map(ctypes.addressof, kept),
     ]
-    return (ctypes.c_int64 * len(numbers))(*numbers), kept
+    return int64_array(numbers), kept
 
 
 def _swap_cuda_batch(
