@@ -1,8 +1,8 @@
 """Draws learning curves of several studies in one figure, from their tables.
 
 ``python compare_precision.py`` compares the precisions of the hidden layers, from
-``docs/results/fetch_push_{bfloat16,float32}.csv``; the page on performance says which
-runs of ``study.py`` these are.
+``docs/results/fetch_push_{bfloat16,float32}.csv``, of an earlier version of
+``study.py``; the page on performance says which runs these are.
 """
 
 from __future__ import annotations
