@@ -78,7 +78,7 @@ def test_scores_and_their_report(environment):
 def test_buffers_of_the_methods(method, cfg, steps):
     learner = steps.parts.make_learner(cfg, method)
     batch = learner.make_buffer(learner.rows()).sample()
-    assert batch["desired_goal"].shape == (160, 21)
+    assert batch["desired_goal"].shape == (320, 21)  # two batches of 16 windows
     if method == "none":
         assert ("caiac", "swapped") not in batch.keys(True)
     else:
@@ -86,7 +86,7 @@ def test_buffers_of_the_methods(method, cfg, steps):
     if method == "relabel_only":
         assert not batch["caiac", "swapped"].any()
     if method == "coda":
-        assert batch["coda", "graph"].shape == (160, 11, 10)
+        assert batch["coda", "graph"].shape == (320, 11, 10)
     if method == "coda_action":
         held = batch["coda", "action"] > cfg.env.augmentation.attention_threshold
         held = held.unflatten(0, (-1, cfg.learner.window)).any(1)
@@ -328,8 +328,8 @@ def test_all_tasks(tmp_path, steps, compose, monkeypatch):
         assert 0 < report["smoothing 1"][task]["influenced"] < 1
     learner = steps.parts.make_learner(cfg, "oracle")
     batch = learner.make_buffer(learner.rows()).sample()
-    # 13 of 16 windows, the ratio being 0.8.
-    assert batch["caiac", "counterfactual"].sum() == 130
+    # 26 of 32 windows in two batches, the ratio being 0.8.
+    assert batch["caiac", "counterfactual"].sum() == 260
     starts = []
     reset = KitchenEnv.reset
 

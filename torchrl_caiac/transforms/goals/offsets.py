@@ -104,16 +104,16 @@ def draw_goal_numbers(
         GoalNumbers(chance=None, share=None, steps=None)
     """
     names = [name for name, weight in mixture.items() if weight > 0]
-    drawn: dict[str, torch.Tensor] = {}
+    chance = share = steps = None
     own: dict[str, Any] = {"device": device, "generator": generator}
     if len(names) > 1:
-        drawn["chance"] = draw_numbers(torch.rand, shape, **own)
+        chance = draw_numbers(torch.rand, shape, **own)
     for name in names:  # in the order of the mixture
         if name == "uniform":
-            drawn["share"] = draw_numbers(torch.rand, shape, dtype=torch.float64, **own)
+            share = draw_numbers(torch.rand, shape, dtype=torch.float64, **own)
         elif name == "geometric":
-            drawn["steps"] = draw_steps(shape, p, **own)
-    return GoalNumbers(*map(drawn.get, GoalNumbers._fields))
+            steps = draw_steps(shape, p, **own)
+    return GoalNumbers(chance, share, steps)
 
 
 def goal_offset(
