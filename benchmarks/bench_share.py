@@ -78,14 +78,11 @@ def bench_lmp_share(
     benchmark: Any, judge: Any, device: torch.device, windows: int, window: int
 ) -> None:
     """Windows with goals: one batch in a sample, and four, which are split."""
-    buffer = make_buffer(windows, window, device, swap=True)
+    buffer, size = make_buffer(windows, window, device, swap=True), windows * window
     plain = ReplayBuffer(
-        storage=buffer.storage,
-        sampler=slices(window),
-        batch_size=windows * window,
+        storage=buffer.storage, sampler=slices(window), batch_size=size
     )
     step, batch = make_step(window, device), buffer.sample()
-    size = windows * window
     times = seconds(
         {
             "plain": plain.sample,

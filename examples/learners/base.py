@@ -116,10 +116,15 @@ class Learner(ABC):
     @property
     def at_once(self) -> int:
         """The number of batches in one sample, ``batches_at_once``, by default 1."""
-        return int(self.settings.get("batches_at_once") or 1)
+        number = self.settings.get("batches_at_once")
+        return 1 if number is None else int(number)
 
     def check_strides(self) -> None:
         """Raises if a run could stop in the middle of a sample."""
+        if self.at_once < 1:
+            raise ValueError(
+                f"learner.batches_at_once is {self.at_once}, expected at least 1"
+            )
         for name in ("steps", "checkpoint_every"):
             if self.settings[name] % self.at_once:
                 raise ValueError(

@@ -261,9 +261,12 @@ def test_any_windows_of_a_batch_are_replaced(
 @pytest.mark.parametrize("row", [-1, 3, 1 << 40, (1 << 63) - 1, -(1 << 63)])
 @pytest.mark.parametrize("has_sources", [False, True])
 @pytest.mark.parametrize("in_torch", [False, True])
-def test_donors_out_of_range(row: int, has_sources: bool, in_torch: bool) -> None:
-    td = TensorDict({"observation": torch.zeros(3, 2)}, [3])
-    td["next"] = td.clone()
+@pytest.mark.parametrize("strided", [False, True])
+def test_donors_out_of_range(
+    row: int, has_sources: bool, in_torch: bool, strided: bool
+) -> None:
+    state = torch.zeros(3, 4)[:, ::2] if strided else torch.zeros(3, 2)
+    td = TensorDict({"observation": state, ("next", "observation"): state}, [3])
     plan, values = SwapPlanner(EntityLayout({"arm": [0], "cup": [1]}))(td)
     donors = torch.tensor([[0, 0], [0, row]])
     draw = SwapDraw(donors, torch.ones_like(donors).bool(), torch.zeros(2).long())

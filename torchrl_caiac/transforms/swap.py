@@ -393,9 +393,10 @@ def apply_swap(
     length = td.shape[0] + rows.numel()
     if not has_own:
         length = max(map(len, sources or ()), default=0)
+    # Rows that are out of range stay so, also negative ones and in half the size.
+    rows = torch.where(rows < 0, length, rows).clamp_max(length)
     if length * max((leaf.width for leaf in plan.leaves), default=0) < 1 << 31:
-        # Half as much to write and to read. Rows that are out of range stay so.
-        rows = rows.clamp(-1, length).int()
+        rows = rows.int()  # half as much to write and to read
     places: dict[int, torch.Tensor] = {}
     masks: dict[tuple[int, int], torch.Tensor] = {}
     leaves: dict[NestedKey, torch.Tensor] = {}

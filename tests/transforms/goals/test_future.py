@@ -122,8 +122,11 @@ def test_goals_ahead_end_with_the_trajectory(
             wanted = torch.minimum(time + steps, ends)[:, None].expand(-1, 2)
             for block in (nullcontext(), only_torch()):
                 with block:
-                    found = goals.read_goals_ahead(data, trajectories, rows, steps)
-                assert torch.equal(found["desired_goal"], wanted.float())
+                    for kind in (torch.int64, torch.int32):
+                        found = goals.read_goals_ahead(
+                            data, trajectories, rows, steps.to(kind)
+                        )
+                        assert torch.equal(found["desired_goal"], wanted.float())
         for bad in ([7, 0], [-1, 0], [0, -1]):
             row, step = (torch.tensor([number]) for number in bad)
             with pytest.raises((IndexError, RuntimeError)):

@@ -21,7 +21,14 @@ from torchrl.data import (
 
 from torchrl_caiac import EntityLayout
 from torchrl_caiac._sampling import is_native, only_torch
-from torchrl_caiac.transforms import CAIACTransform, TransformKeys, WindowGoal
+from torchrl_caiac.data import offline_buffer
+from torchrl_caiac.transforms import (
+    CAIACTransform,
+    HindsightGoal,
+    TransformKeys,
+    WindowGoal,
+)
+from torchrl_caiac.transforms.goals.future import FutureGoal
 
 LAYOUT = EntityLayout(
     {"arm": [0], "cup": [1, 2]},
@@ -197,9 +204,10 @@ def test_goals_are_later_states_of_the_same_trajectory(
     dtype=st.sampled_from([torch.float32, torch.float64, torch.float16]),
     size=st.integers(0, 20),
     twisted=st.booleans(),
+    default=st.sampled_from([torch.float32, torch.float64]),
 )
 def test_goals_in_c_are_those_of_torch(
-    lengths, window, mixture, p, seed, dtype, size, twisted
+    lengths, window, mixture, p, seed, dtype, size, twisted, default
 ) -> None:
     data = make([*lengths, window + 2])
     data["next", "observation"] = data["next", "observation"].to(dtype)
@@ -223,13 +231,36 @@ def test_goals_in_c_are_those_of_torch(
     assert is_native(rows)
     batch, found = storage[:][rows], []
     for context in (nullcontext(), only_torch()):
-        with context:
-            generator.manual_seed(seed)
-            goals.expand(rows, {}, storage)
-            found.append(goals(batch))
+        generator.manual_seed(seed)
+        torch.set_default_dtype(default)
+        try:
+            with context:
+                goals.expand(rows, {}, storage)
+        finally:
+            torch.set_default_dtype(torch.float32)
+        found.append(goals(batch))
     for key in ("desired_goal", ("hindsight", "steps")):
         assert found[0][key].dtype == found[1][key].dtype
         assert torch.equal(found[0][key], found[1][key])
+
+
+@pytest.mark.parametrize("base", [WindowGoal, HindsightGoal])
+def test_a_subclass_reads_its_own_goals(base: type[FutureGoal]) -> None:
+    class Zeros(base):
+        def read_goals(self, data, rows=None):
+            found = super().read_goals(data, rows)
+            return {key: torch.zeros_like(goal) for key, goal in found.items()}
+
+    data = make([9])
+    data["desired_goal"] = torch.ones(9, 2)
+    data["next", "reward"] = torch.zeros(9, 1)
+    options = {"window": 1}
+    if base is HindsightGoal:
+        options = {"reward_fn": lambda achieved, goal: achieved[:, 0], "future": 1.0}
+    goals = Zeros(LAYOUT, **options)
+    rb = offline_buffer(data, 30, sample_unit=goals)
+    rb.append_transform(goals)
+    assert not rb.sample()["desired_goal"].any()
 
 
 def test_last_respects_writes_and_the_cursor() -> None:

@@ -299,19 +299,51 @@ class FutureGoal(RandomTransform, SampleUnit):
             IndexError: a row is out of range.
             KeyError: the data lack the leaf that goals are read from.
         """
-        if self.layout.is_flat and trajectories.order is None:
-            source, left = self.flat_source(data), trajectories.left
-            if (
-                (rows.ndim, rows.dtype, rows.device.type) == (1, torch.int64, "cpu")
-                and left.dtype in (torch.int32, torch.int64)
-                and steps.shape == rows.shape
-                and len(left) <= len(source)
-                and is_native(rows, steps, sources=[source, left])
-            ):
-                columns = self._goal_columns[1]
-                goals = read_ahead(source, columns, rows, steps, left)
-                return {self.layout.desired_goal_key: goals}
+        source = None
+        if (steps.dtype, steps.shape) == (torch.int64, rows.shape):
+            source = self.source_in_c(data, trajectories, rows, steps)
+        if source is not None:
+            columns, left = self._goal_columns[1], trajectories.left
+            goals = read_ahead(source, columns, rows, steps, left)
+            return {self.layout.desired_goal_key: goals}
         return self.read_goals(data, trajectories.ahead(rows, steps))
+
+    def source_in_c(
+        self,
+        data: TensorDictBase,
+        trajectories: TrajectoryIndex,
+        rows: torch.Tensor,
+        *numbers: torch.Tensor,
+    ) -> torch.Tensor | None:
+        """Returns the leaf of goals if functions in C can read goals ahead of rows.
+
+        Args:
+            data (TensorDictBase): what ``rows`` are rows of, ``[T]``.
+            trajectories (TrajectoryIndex): its trajectories.
+            rows (torch.Tensor): integer ``[M]``.
+            *numbers (torch.Tensor): what else the function reads.
+
+        Returns:
+            torch.Tensor, optional: ``[T, D]``, as of :meth:`flat_source`; ``None`` if
+            goals are read by :meth:`read_goals`.
+
+        Raises:
+            KeyError: the data lack the leaf.
+            ValueError: it has too few columns.
+        """
+        left = trajectories.left
+        if (
+            not self.layout.is_flat
+            or type(self).read_goals is not FutureGoal.read_goals
+            or trajectories.order is not None
+            or (rows.ndim, rows.dtype, rows.device.type) != (1, torch.int64, "cpu")
+            or left.dtype not in (torch.int32, torch.int64)
+        ):
+            return None
+        source = self.flat_source(data)
+        if len(left) > len(source):
+            return None
+        return source if is_native(rows, *numbers, sources=[source, left]) else None
 
     # --- copying ---------------------------------------------------------------------
 

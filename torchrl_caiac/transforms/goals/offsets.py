@@ -107,7 +107,7 @@ def draw_goal_numbers(
     chance = share = steps = None
     own: dict[str, Any] = {"device": device, "generator": generator}
     if len(names) > 1:
-        chance = draw_numbers(torch.rand, shape, **own)
+        chance = draw_numbers(torch.rand, shape, dtype=torch.float32, **own)
     for name in names:  # in the order of the mixture
         if name == "uniform":
             share = draw_numbers(torch.rand, shape, dtype=torch.float64, **own)

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_caiac._batches import with_leaves
 from torchrl_caiac._keys import path
-from torchrl_caiac._sampling import is_native, window_goals
+from torchrl_caiac._sampling import window_goals
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_window
@@ -206,30 +206,21 @@ class WindowGoal(FutureGoal):
         numbers: GoalNumbers,
     ) -> dict[NestedKey, torch.Tensor] | None:
         """Reads goals by one function of C; ``None`` where it cannot."""
-        layout, left = self.layout, trajectories.left
-        if (
-            not layout.is_flat
-            or trajectories.order is not None
-            or rows.dtype is not torch.int64
-            or rows.device.type != "cpu"
-            or LateCheck.needed(rows.device)  # it raises at once
-            or left.dtype not in (torch.int32, torch.int64)
-        ):
+        if LateCheck.needed(rows.device):  # the function raises at once
             return None
-        source = self.flat_source(data)
         drawn = [x for x in numbers if x is not None]
-        sources = [source, left]
-        if len(left) > len(source) or not is_native(rows, *drawn, sources=sources):
+        source = self.source_in_c(data, trajectories, rows, *drawn)
+        if source is None:
             return None
         bounds = [
             (_STRATEGIES.index(name), least)
             for name, least in strategy_bounds(self.mixture)
         ]
-        columns = self.goal_columns
+        left, columns = trajectories.left, self.goal_columns
         found = window_goals(rows, self.window, left, bounds, numbers, source, columns)
         if found is None:
             return None
-        return {layout.desired_goal_key: found[0], self.keys.goal_steps: found[1]}
+        return {self.layout.desired_goal_key: found[0], self.keys.goal_steps: found[1]}
 
     def _read(
         self,
