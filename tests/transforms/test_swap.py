@@ -276,6 +276,38 @@ def test_donors_out_of_range(
         apply_swap(td, plan, values, draw, sources=sources)
 
 
+@pytest.mark.parametrize("row", [-1, 12, 15, 1 << 40, -(1 << 63)])
+@pytest.mark.parametrize("oldest", [0, 6])  # in the order of time, and a ring
+@pytest.mark.parametrize("strided", [False, True])
+def test_donor_windows_out_of_range(row: int, oldest: int, strided: bool) -> None:
+    state = torch.arange(48.0).view(12, 4)[:, ::2]
+    state = state if strided else state.contiguous()
+    source = TensorDict(
+        {
+            "observation": state,
+            "episode": torch.zeros(12, dtype=torch.int64),
+            "next": {"observation": state},
+        },
+        [12],
+    )
+    planner = SwapPlanner(EntityLayout({"arm": [0], "cup": [1]}))
+    td = source[:4]
+    (plan, values), (_, stored) = planner(td), planner(source)
+    trajectories = trajectory_index(source, done_key=None)._replace(oldest=oldest)
+    donors = torch.tensor([[0, 3], [0, row]])
+    draw = SwapDraw(donors, torch.ones_like(donors).bool(), torch.zeros(2).long())
+    with pytest.raises(IndexError, match="out of range"):
+        apply_swap(
+            td,
+            plan,
+            values,
+            draw,
+            window=2,
+            sources=[stored[leaf.place] for leaf in plan.leaves],
+            trajectories=trajectories,
+        )
+
+
 def test_places_in_storages_of_more_than_two_billion_values() -> None:
     """Their places do not fit into 32 bits. The source takes the memory of one row."""
     td = flat(1)

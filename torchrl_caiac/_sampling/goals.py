@@ -213,7 +213,8 @@ def window_goals(
             trajectory of each row.
         bounds (sequence of tuple): strategies, 0, 1 or 2, with the least ``chance`` for
             which they are taken, ascending from 0.
-        numbers (sequence of torch.Tensor): see ``GoalNumbers``, ``[W]`` each.
+        numbers (sequence of torch.Tensor): ``chance``, ``share`` and ``steps`` of
+            ``GoalNumbers``, ``[W]`` each; ``None`` where no strategy needs them.
         source (torch.Tensor): what goals are read from, ``[T, D]``, a ring.
         columns (tuple of int): its columns that are goals, ``G``.
 

@@ -65,7 +65,8 @@ def pick_places(source: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     """
     if source.is_contiguous():
         return source.view(-1).index_select(0, places)
-    return source.take(places.long())  # flattening would copy all of it
+    # Flattening would copy all of it. A negative place would count from the end.
+    return source.take(places.long().masked_fill(places < 0, source.numel()))
 
 
 @lru_cache(maxsize=64)

@@ -387,15 +387,17 @@ def apply_swap(
     rows = torch.where(draw.swapped, donors, own)
     if plan.has_rest:  # one more entity, which is never swapped
         rows = torch.cat([rows, own], -1)
-    if trajectories is not None and window > 1:
-        steps = torch.arange(window, device=device).view(-1, 1)
-        rows = trajectories.later(rows.unsqueeze(1), steps)
     length = td.shape[0] + rows.numel()
     if not has_own:
         length = max(map(len, sources or ()), default=0)
-    # Rows that are out of range stay so, also negative ones and in half the size.
-    rows = torch.where(rows < 0, length, rows).clamp_max(length)
-    if length * max((leaf.width for leaf in plan.leaves), default=0) < 1 << 31:
+    outside = (rows < 0) | (rows >= length)
+    if trajectories is not None and window > 1:
+        steps = torch.arange(window, device=device).view(-1, 1)
+        rows = trajectories.later(rows.masked_fill(outside, 0).unsqueeze(1), steps)
+        outside = outside.unsqueeze(1)
+    rows = rows.masked_fill(outside, length)  # reading it raises
+    width = max((leaf.width for leaf in plan.leaves), default=0)
+    if (length + window) * width < 1 << 31:
         rows = rows.int()  # half as much to write and to read
     places: dict[int, torch.Tensor] = {}
     masks: dict[tuple[int, int], torch.Tensor] = {}

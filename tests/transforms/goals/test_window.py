@@ -244,6 +244,34 @@ def test_goals_in_c_are_those_of_torch(
         assert torch.equal(found[0][key], found[1][key])
 
 
+@pytest.mark.parametrize("mixture", [{}, {"last": 0.0}, {"first": 1.0}])
+def test_a_mixture_that_is_replaced_is_checked(mixture: dict[str, float]) -> None:
+    goals = WindowGoal(LAYOUT, 1)
+    storage = buffer(goals, [5]).storage
+    goals.mixture = mixture
+    for context in (nullcontext(), only_torch()):
+        with context, pytest.raises(ValueError, match="mixture"):
+            goals.expand(torch.tensor([0]), {}, storage)
+
+
+def test_the_mixture_is_read_once_for_a_sample() -> None:
+    class Changing(WindowGoal):
+        @property
+        def mixture(self) -> dict[str, float]:
+            self.times = self.__dict__.get("times", 0) + 1
+            return {"uniform" if self.times % 2 else "last": 1.0}
+
+        @mixture.setter
+        def mixture(self, value: dict[str, float]) -> None:
+            pass
+
+    goals = Changing(LAYOUT, 1)
+    storage = buffer(goals, [5]).storage
+    before = goals.__dict__.get("times", 0)
+    goals.expand(torch.tensor([0]), {}, storage)
+    assert goals.times == before + 1
+
+
 @pytest.mark.parametrize("base", [WindowGoal, HindsightGoal])
 def test_a_subclass_reads_its_own_goals(base: type[FutureGoal]) -> None:
     class Zeros(base):
@@ -343,6 +371,7 @@ def test_pickle_and_clone() -> None:
         ({"mixture": {"last": -1.0}}, "weights of mixture"),
         ({"mixture": {"last": 0.0}}, "weights of mixture"),
         ({"mixture": {"last": math.nan}}, "weights of mixture"),
+        ({"mixture": {"last": 1e308, "uniform": 1e308}}, "weights of mixture"),
         ({"p": 0.0}, r"must be in \(0, 1\]"),
         ({"p": 1.1}, r"must be in \(0, 1\]"),
         ({"layout": EntityLayout({"cup": [0]})}, "no goals"),
@@ -414,6 +443,10 @@ def test_data_that_do_not_fit() -> None:
         draw(data.exclude(("next", "observation")))
     with pytest.raises(KeyError, match=r"goals of .*cup.* are read"):
         draw(data, WindowGoal(NESTED, 1))
+    strided = TensorDict({("next", "observation"): torch.zeros(5, 6)[:, ::2]}, [5])
+    for row in (-1, 5):
+        with pytest.raises(IndexError, match="out of range"):
+            goals.read_goals(strided, torch.tensor([row]))
     data["next", "observation"] = torch.zeros(5, 2)
     with pytest.raises(ValueError, match=r"2 columns.*at least 3"):
         draw(data)

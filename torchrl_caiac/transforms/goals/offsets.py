@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import torch
 from torchrl_caiac._random import draw_numbers
 
 __all__ = [
+    "STRATEGIES",
     "GoalNumbers",
     "draw_goal_numbers",
     "draw_goal_offset",
@@ -18,17 +20,23 @@ __all__ = [
     "strategy_bounds",
 ]
 
+STRATEGIES = ("last", "uniform", "geometric")
+"""How goals are drawn, see :func:`draw_goal_offset`; numbered as in ``sampling.c``."""
+
 
 class GoalNumbers(NamedTuple):
     """The random numbers that goals of windows are drawn with.
 
     Attributes:
+        bounds (list of tuple): the strategies, with the least ``chance`` for which each
+            is taken, ascending from 0.
         chance (torch.Tensor, optional): float32 ``[*]``, below 1, which strategy each
             window has; ``None`` if there is one.
         share (torch.Tensor, optional): float64 ``[*]``, below 1, of ``uniform``.
         steps (torch.Tensor, optional): int64 ``[*]``, of ``geometric``.
     """
 
+    bounds: list[tuple[str, float]]
     chance: torch.Tensor | None
     share: torch.Tensor | None
     steps: torch.Tensor | None
@@ -62,6 +70,9 @@ def draw_goal_offset(
     Returns:
         torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
 
+    Raises:
+        ValueError: the mixture has an unknown strategy or a wrong weight.
+
     Examples:
         >>> import torch
         >>> from torchrl_caiac.transforms.goals.offsets import draw_goal_offset
@@ -71,7 +82,7 @@ def draw_goal_offset(
     numbers = draw_goal_numbers(
         remaining.shape, mixture, p=p, device=remaining.device, generator=generator
     )
-    return goal_offset(remaining, mixture, numbers)
+    return goal_offset(remaining, numbers)
 
 
 def draw_goal_numbers(
@@ -96,36 +107,36 @@ def draw_goal_numbers(
     Returns:
         GoalNumbers: the numbers that the strategies need.
 
+    Raises:
+        ValueError: the mixture has an unknown strategy or a wrong weight.
+
     Examples:
         >>> import torch
         >>> from torchrl_caiac.transforms.goals.offsets import draw_goal_numbers
         >>> shape, device = torch.Size([2]), torch.device("cpu")
         >>> draw_goal_numbers(shape, {"last": 1.0}, p=0.3, device=device)
-        GoalNumbers(chance=None, share=None, steps=None)
+        GoalNumbers(bounds=[('last', 0.0)], chance=None, share=None, steps=None)
     """
-    names = [name for name, weight in mixture.items() if weight > 0]
+    bounds = strategy_bounds(mixture)
     chance = share = steps = None
     own: dict[str, Any] = {"device": device, "generator": generator}
-    if len(names) > 1:
+    if len(bounds) > 1:
         chance = draw_numbers(torch.rand, shape, dtype=torch.float32, **own)
-    for name in names:  # in the order of the mixture
+    for name, _ in bounds:
         if name == "uniform":
             share = draw_numbers(torch.rand, shape, dtype=torch.float64, **own)
         elif name == "geometric":
             steps = draw_steps(shape, p, **own)
-    return GoalNumbers(chance, share, steps)
+    return GoalNumbers(bounds, chance, share, steps)
 
 
-def goal_offset(
-    remaining: torch.Tensor, mixture: Mapping[str, float], numbers: GoalNumbers
-) -> torch.Tensor:
+def goal_offset(remaining: torch.Tensor, numbers: GoalNumbers) -> torch.Tensor:
     """Returns the number of rows from each window to its goal.
 
     Args:
         remaining (torch.Tensor): int64 ``[*]``, rows of the trajectory after the
             window.
-        mixture (mapping of str to float): the weight of each strategy.
-        numbers (GoalNumbers): of :func:`draw_goal_numbers`, for the same mixture.
+        numbers (GoalNumbers): of :func:`draw_goal_numbers`.
 
     Returns:
         torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
@@ -133,12 +144,13 @@ def goal_offset(
     Examples:
         >>> import torch
         >>> from torchrl_caiac.transforms.goals.offsets import GoalNumbers, goal_offset
-        >>> numbers = GoalNumbers(None, None, torch.tensor([1, 1]))
-        >>> goal_offset(torch.tensor([4, 0]), {"geometric": 1.0}, numbers)
+        >>> bounds, steps = [("geometric", 0.0)], torch.tensor([1, 1])
+        >>> numbers = GoalNumbers(bounds, None, None, steps)
+        >>> goal_offset(torch.tensor([4, 0]), numbers)
         tensor([1, 0])
     """
     offset = remaining
-    for name, least in strategy_bounds(mixture):
+    for name, least in numbers.bounds:
         drawn = remaining
         if name == "uniform":
             assert numbers.share is not None
@@ -162,17 +174,30 @@ def strategy_bounds(mixture: Mapping[str, float]) -> list[tuple[str, float]]:
     Returns:
         list of tuple: strategies and bounds, ascending from 0.
 
+    Raises:
+        ValueError: the mixture has an unknown strategy or a wrong weight.
+
     Examples:
         >>> from torchrl_caiac.transforms.goals.offsets import strategy_bounds
         >>> strategy_bounds({"last": 1.0, "uniform": 0.0, "geometric": 3.0})
         [('last', 0.0), ('geometric', 0.25)]
     """
-    weights = {name: weight for name, weight in mixture.items() if weight > 0}
-    total, below = sum(weights.values()), 0.0
-    found = []
-    for name, weight in weights.items():
-        found.append((name, below / total))
-        below += weight
+    mixture = dict(mixture)  # which another thread may change
+    if not mixture or not set(mixture) <= set(STRATEGIES):
+        raise ValueError(
+            f"mixture maps strategies among {list(STRATEGIES)} to weights, got "
+            f"{mixture}"
+        )
+    total, below, found = sum(mixture.values()), 0.0, []
+    if not all(weight >= 0 for weight in mixture.values()) or not 0 < total < math.inf:
+        raise ValueError(
+            "the weights of mixture are at least 0, and their sum is positive and "
+            f"finite; got {mixture}"
+        )
+    for name, weight in mixture.items():
+        if weight > 0:
+            found.append((name, below / total))
+            below += weight
     return found
 
 

@@ -18,6 +18,7 @@ from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
 from torchrl_caiac.transforms.checks import LateCheck, check_window
 from torchrl_caiac.transforms.goals.future import FutureGoal
 from torchrl_caiac.transforms.goals.offsets import (
+    STRATEGIES,
     GoalNumbers,
     draw_goal_numbers,
     draw_goal_offset,
@@ -28,8 +29,6 @@ from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tens
 from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = ["WindowGoal"]
-
-_STRATEGIES = ("last", "uniform", "geometric")  # numbered as in sampling.c
 
 
 class WindowGoal(FutureGoal):
@@ -108,18 +107,7 @@ class WindowGoal(FutureGoal):
         if mixture is None:
             mixture = {"last": 0.5, "geometric": 0.5}
         self.window = check_window(window)
-        unknown = [name for name in mixture if name not in _STRATEGIES]
-        if unknown or not mixture:
-            raise ValueError(
-                f"mixture maps strategies among {list(_STRATEGIES)} to weights, got "
-                f"{dict(mixture)}"
-            )
-        weights = list(mixture.values())
-        if not all(0 <= w < float("inf") for w in weights) or sum(weights) <= 0:
-            raise ValueError(
-                "the weights of mixture are at least 0, finite, and not all 0; got "
-                f"{dict(mixture)}"
-            )
+        strategy_bounds(mixture)  # or raises
         self.mixture = dict(mixture)
         self.out_keys = [*self.goal_keys, self.keys.goal_steps]
 
@@ -208,16 +196,14 @@ class WindowGoal(FutureGoal):
         """Reads goals by one function of C; ``None`` where it cannot."""
         if LateCheck.needed(rows.device):  # the function raises at once
             return None
-        drawn = [x for x in numbers if x is not None]
-        source = self.source_in_c(data, trajectories, rows, *drawn)
+        drawn = numbers[1:]
+        own = [x for x in drawn if x is not None]
+        source = self.source_in_c(data, trajectories, rows, *own)
         if source is None:
             return None
-        bounds = [
-            (_STRATEGIES.index(name), least)
-            for name, least in strategy_bounds(self.mixture)
-        ]
+        bounds = [(STRATEGIES.index(name), least) for name, least in numbers.bounds]
         left, columns = trajectories.left, self.goal_columns
-        found = window_goals(rows, self.window, left, bounds, numbers, source, columns)
+        found = window_goals(rows, self.window, left, bounds, drawn, source, columns)
         if found is None:
             return None
         return {self.layout.desired_goal_key: found[0], self.keys.goal_steps: found[1]}
@@ -236,7 +222,7 @@ class WindowGoal(FutureGoal):
         if self.window > 1:
             self._check_windows(windows, remaining, trajectories)
         # Below zero only if an error is raised later.
-        offset = goal_offset(remaining.clamp_min(0), self.mixture, numbers)
+        offset = goal_offset(remaining.clamp_min(0), numbers)
         goals = self.read_goals(data, trajectories.later(last, offset))
         steps = offset.unsqueeze(-1)
         if self.window > 1:
