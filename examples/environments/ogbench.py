@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 
 from environments.base import Environment
+from environments.one_goal import OneGoal
 from environments.playing import Split, play_together
 from shared.settings import keep_settings
 from torchrl_caiac import EntityLayout
@@ -33,8 +34,11 @@ from torchrl_caiac.trajectories import trajectory_index
 __all__ = ["HandleDistance", "OGBench"]
 
 TASKS = 5  # OGBench has as many in each environment
+# Which goals the policy is told at a time, and the measure of its success.
+GOALS = {"all": "success", "one": "success, one goal at a time"}
 # Positions in observations are 10 x (m - CENTRE).
 SCALE, CENTRE = 10.0, (0.425, 0.0, 0.0)
+REACHED = 0.04  # m, from the goal of a cube, see OGBench
 # Where the hand takes hold of what has no position in space in the observation.
 HANDLES = {"drawer": "drawer_handle_center", "window": "window_handle_center"}
 
@@ -46,6 +50,9 @@ class OGBench(Environment):
     as the positions of the cubes. In OGBench's other datasets the goal is a whole
     observation, with a posture of the robot that no task asks for. A swap exchanges the
     goal of an entity with its state, which such a posture does not allow.
+
+    ``env.evaluate.goals`` lists what policies are told: ``all`` goals, which is OGBench's
+    evaluation, or ``one`` goal at a time, see :class:`~environments.one_goal.OneGoal`.
 
     ``env.demonstrations`` is the number of episodes to learn from, the first ones.
     ``held_out`` are rows of episodes with another seed, some steps apart, which only
@@ -185,8 +192,13 @@ class OGBench(Environment):
         results = []
         seeds = self._seeds(split)
         self._make_envs(max(map(len, seeds.values())))
-        for task, own in seeds.items():
-            results += play_task(actor, self._envs[: len(own)], task, own)
+        for goals in self.settings.evaluate.goals:
+            told = actor
+            if goals == "one":
+                told = OneGoal(actor, self.layout, SCALE * REACHED)
+            for task, own in seeds.items():
+                episodes = play_task(told, self._envs[: len(own)], task, own)
+                results += [{**episode, "goals": goals} for episode in episodes]
         return results
 
     def _seeds(self, split: str) -> dict[int, range]:
@@ -210,6 +222,12 @@ class OGBench(Environment):
                 f"env.evaluate.tasks is {list(settings.tasks)}, expected some of 1 to "
                 f"{TASKS}"
             )
+        goals = list(settings.goals)
+        if not goals or len(set(goals)) < len(goals) or not set(goals) <= set(GOALS):
+            raise ValueError(
+                f"env.evaluate.goals is {goals}, expected some of {list(GOALS)}, each "
+                "once"
+            )
         first, n = starts[split]
         return {
             task: range(first + (task - 1) * n, first + task * n)
@@ -223,18 +241,18 @@ class OGBench(Environment):
 
     def measures(self, episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Returns the success of each task."""
-        results = []
-        for task in dict.fromkeys(episode["task"] for episode in episodes):
-            mine = [e["success"] for e in episodes if e["task"] == task]
-            results.append(
-                {
-                    "task": task,
-                    "measure": "success",
-                    "episodes": len(mine),
-                    "value": float(np.mean(mine)),
-                }
-            )
-        return results
+        kinds: dict[tuple[str, str], list[bool]] = {}
+        for e in episodes:
+            kinds.setdefault((e["task"], GOALS[e["goals"]]), []).append(e["success"])
+        return [
+            {
+                "task": task,
+                "measure": measure,
+                "episodes": len(found),
+                "value": float(np.mean(found)),
+            }
+            for (task, measure), found in kinds.items()
+        ]
 
 
 class HandleDistance:

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs.ogbench import make_ogbench_env, ogbench_cube_reward
+from torchrl_caiac.layouts import ready_layout
 from torchrl_caiac.transforms import HindsightGoal
 
 CENTRE = np.array([0.425, 0.0, 0.0])
@@ -235,8 +236,55 @@ def test_episodes_that_reach_no_goal_end(steps, compose, tmp_path):
     cfg = changed(cfg, evaluate={"tasks": [3], "episodes": 1})
     environment = steps.parts.make_environment(cfg)
     (episode,) = environment.play(Still(most=-1), 0, tmp_path)
-    assert episode == {"task": "task3", "episode": 0, "success": False, "steps": 500}
+    expected = {"task": "task3", "episode": 0, "success": False, "steps": 500}
+    assert episode == {**expected, "goals": "all"}
     assert environment.measures([episode])[0]["value"] == 0.0
+
+
+def test_one_goal_is_told_at_a_time(steps):
+    from environments.one_goal import OneGoal
+
+    layout = ready_layout("ogbench/cube-double")
+    told = []
+
+    def actor(td):
+        told.append(td["desired_goal"].clone())
+        return TensorDict({"action": torch.zeros(len(td), 5)}, td.batch_size)
+
+    policy = OneGoal(actor, layout, tolerance=0.4)
+    state = torch.zeros(4, 37)
+    goals = torch.zeros(4, 6)
+    goals[0] = torch.tensor([0.0, 0, 0, 2, 0, 0.0])  # the second cube's
+    goals[1] = torch.tensor([2.0, 0, 1, 0, 2, 0.5])  # the second one's is lower
+    goals[2] = torch.tensor([2.0, 0, 0, 0, 2, 0.0])  # the first one's, of equal ones
+    goals[3] = torch.tensor([0.3, 0, 0, 0, 0.3, 0.0])  # both are reached
+    td = TensorDict({"observation": state, "desired_goal": goals}, [4])
+    out = policy(td)
+    assert torch.equal(td["desired_goal"], goals) and out["action"].shape == (4, 5)
+    expected = goals.clone()
+    expected[1, :3] = 0
+    expected[2, 3:] = 0
+    assert torch.equal(told[0], expected)
+    # Cubes have moved: that goal stays until it is reached.
+    state[1, 19:22] = state[1, 28:31] = torch.tensor([1.0, 1, 0])
+    state[2, 19:22] = goals[2, :3]
+    policy(td.update(out["next"]))
+    assert told[1][1].tolist() == [1, 1, 0, 0, 2, 0.5]
+    assert told[1][2].tolist() == goals[2].tolist()
+
+
+def test_tasks_are_played_with_one_goal_too(steps, compose, tmp_path):
+    cfg = compose("env=ogbench_cube_double_play", out=tmp_path)
+    cfg = changed(cfg, evaluate={"tasks": [5], "goals": ["all", "one"]})
+    environment = steps.parts.make_environment(cfg)
+    oracle = Oracle()
+    episodes = environment.play(oracle, 0, tmp_path)
+    assert [e["goals"] for e in episodes] == ["all"] * 2 + ["one"] * 2
+    assert all(e["success"] for e in episodes)
+    assert environment.measures(episodes) == [
+        {"task": "task5", "measure": measure, "episodes": 2, "value": 1.0}
+        for measure in ("success", "success, one goal at a time")
+    ]
 
 
 def test_starts_depend_on_the_split_alone(steps, compose, tmp_path):
@@ -263,6 +311,9 @@ def test_starts_depend_on_the_split_alone(steps, compose, tmp_path):
         ({"validation_seed": 1_000_009}, "change validation_seed"),
         ({"tasks": [0, 1]}, r"expected some of 1 to 5"),
         ({"tasks": []}, r"expected some of 1 to 5"),
+        ({"goals": []}, r"goals is \[\], expected some of"),
+        ({"goals": ["all", "all"]}, "each once"),
+        ({"goals": ["two"]}, r"expected some of \['all', 'one'\]"),
     ],
 )
 def test_wrong_settings_of_the_evaluation(wrong, match, steps, compose, tmp_path):

@@ -424,6 +424,32 @@ def test_rejects_bad_arguments():
         )
 
 
+class Outcomes(Read):
+    """Reads the state of a simulator; its layout is not that of the observations."""
+
+    in_keys = ("physics",)
+
+    def forward(self, td):
+        return td["physics"][:, :1].expand(-1, 3)
+
+
+def test_data_are_checked_by_a_layout_of_their_own_states(caplog):
+    # The second column is a function of the first one, an error for the layout.
+    rows = episodes([30] * 8)
+    rows["observation"][:, 1] = 2 * rows["observation"][:, 0]
+    rows["next", "observation"][:, 1] = 2 * rows["next", "observation"][:, 0]
+    for td in (rows, rows["next"]):
+        td["physics"] = td["observation"][:, 2:]
+    for estimator, warnings in ((Outcomes(), 0), (Read(), 1)):
+        caplog.clear()
+        score_buffer(filled(rows.clone()), estimator, progress=False)
+        found = [m for m in caplog.messages if m.startswith("mixed_columns")]
+        assert len(found) == warnings
+    rows["physics"][3] = torch.nan
+    with pytest.raises(ValueError, match="NaN"):
+        score_buffer(filled(rows), Outcomes(), progress=False)
+
+
 def test_the_progress_bar_counts_rows(capsys):
     score_buffer(filled(episodes([5, 7])), Read(), 4)
     assert "12/12" in capsys.readouterr().err

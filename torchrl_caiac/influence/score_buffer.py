@@ -39,7 +39,7 @@ from torchrl_caiac.influence.score_pass import (
 )
 from torchrl_caiac.influence.score_record import score_settings, settings_digest
 from torchrl_caiac.influence.score_spread import warn_of_one_side
-from torchrl_caiac.influence.scorer import Scorer, layout_of
+from torchrl_caiac.influence.scorer import Scorer, layout_of, reads_state
 from torchrl_caiac.influence.shards import (
     check_shard,
     has_parts,
@@ -169,7 +169,8 @@ def score_buffer(
         overwrite (bool): recompute all scores, whatever the leaf contains. Defaults to
             ``False``.
         check (bool): check a sample of the data first, see
-            :func:`~torchrl_caiac.check_dataset`. Defaults to ``True``.
+            :func:`~torchrl_caiac.check_dataset`, if the estimator reads its states.
+            Defaults to ``True``.
         progress (bool): show a progress bar. Defaults to ``True``.
         shard (tuple of int, optional): ``(i, n)``, if ``n`` processes, on one machine
             or several, score a folder together, of which this one is number ``i``,
@@ -250,7 +251,7 @@ def score_buffer(
     is_prepared = False
     for number in range(_MOST_PASSES):
         index = trajectory_index(rb, trajectory_key=trajectory_key, done_key=done_key)
-        if check and not number:
+        if check and not number and reads_state(estimator, layout):
             check_before_use(
                 rb,
                 layout,

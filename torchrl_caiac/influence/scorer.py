@@ -18,7 +18,13 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
 from torchrl_caiac.trajectories import TrajectoryIndex
 
-__all__ = ["Scorer", "layout_of", "reads_state_only", "to_device_of"]
+__all__ = [
+    "Scorer",
+    "layout_of",
+    "reads_state",
+    "reads_state_only",
+    "to_device_of",
+]
 
 _NAMED = 8  # rows that an error names
 _SAMPLE = 4096  # states that are passed to the estimator's prepare()
@@ -432,6 +438,14 @@ def layout_of(estimator: Any) -> EntityLayout:
 def reads_state_only(estimator: Any, layout: EntityLayout) -> bool:
     """Returns whether an estimator reads nothing but the state of a layout."""
     return set(_in_keys(estimator, layout)) <= set(layout.in_keys)
+
+
+def reads_state(estimator: Any, layout: EntityLayout) -> bool:
+    """Returns whether an estimator reads the state of a layout.
+
+    The layout of a simulator has the columns of what it computes, not of the data.
+    """
+    return set(layout.in_keys) <= set(_in_keys(estimator, layout))
 
 
 def to_device_of(estimator: Any, states: TensorDictBase) -> TensorDictBase:
