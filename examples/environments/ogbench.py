@@ -51,8 +51,9 @@ class OGBench(Environment):
     observation, with a posture of the robot that no task asks for. A swap exchanges the
     goal of an entity with its state, which such a posture does not allow.
 
-    ``env.evaluate.goals`` lists what policies are told: ``all`` goals, which is OGBench's
-    evaluation, or ``one`` goal at a time, see :class:`~environments.one_goal.OneGoal`.
+    ``env.evaluate.goals`` lists what policies are told: ``all`` goals, which is
+    OGBench's evaluation, or ``one`` goal at a time, see
+    :class:`~environments.one_goal.OneGoal`.
 
     ``env.demonstrations`` is the number of episodes to learn from, the first ones.
     ``held_out`` are rows of episodes with another seed, some steps apart, which only
