@@ -189,17 +189,12 @@ def uninfluenced(
         tensor([[ True],
                 [False]])
     """
-    if (
-        scores.ndim == 2
-        and scores.dtype is torch.float32
-        and not len(scores) % window
-        and is_native(scores)
-    ):
+    if (scores.ndim, scores.dtype) == (2, torch.float32) and not len(scores) % window:
         limits = _limits(threshold, scores.device)
         if (
             limits.dtype is torch.float32
             and limits.shape in ((), scores.shape[1:])
-            and is_native(limits)
+            and is_native(scores, limits)
         ):
             return free_windows(scores, limits, window)
     return window_max(scores, window) <= threshold

@@ -227,7 +227,7 @@ def draw_steps(
 
     def draw(*, generator: Any, **kwargs: Any) -> torch.Tensor:
         trials = torch.empty(shape, dtype=torch.int64, **kwargs)
-        return trials.geometric_(p, generator=generator) - 1
+        return trials.geometric_(p, generator=generator).sub_(1)
 
     if p >= 1.0:
         return torch.zeros(shape, dtype=torch.int64, device=device)
