@@ -359,6 +359,12 @@ def test_pickle_and_clone() -> None:
         assert "window=2" in repr(copy)
 
 
+def test_a_clone_has_its_own_mixture() -> None:
+    goals = WindowGoal(LAYOUT, 2, mixture={"last": 1.0})
+    goals.clone().mixture["uniform"] = 9.0
+    assert goals.mixture == {"last": 1.0}
+
+
 # --- bad input -----------------------------------------------------------------------
 
 

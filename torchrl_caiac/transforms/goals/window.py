@@ -332,6 +332,12 @@ class WindowGoal(FutureGoal):
                     leaves[after] = leaves[key]
         return with_leaves(tensordict, leaves)
 
+    def clone(self) -> WindowGoal:
+        """Returns a copy with its own mixture."""
+        clone: WindowGoal = super().clone()
+        clone.mixture = dict(self.mixture)
+        return clone
+
     def extra_repr(self) -> str:
         """Returns the arguments, for ``repr``."""
         return f"window={self.window}, mixture={self.mixture}, p={self.p}"
