@@ -36,6 +36,7 @@ from tests.influence.scoring import (
 )
 from torchrl_caiac import EntityLayout
 from torchrl_caiac._torchrl import storage_data
+from torchrl_caiac.check import DatasetError
 from torchrl_caiac.influence import (
     CAI,
     score_buffer,
@@ -448,6 +449,31 @@ def test_data_are_checked_by_a_layout_of_their_own_states(caplog):
     rows["physics"][3] = torch.nan
     with pytest.raises(ValueError, match="NaN"):
         score_buffer(filled(rows), Outcomes(), progress=False)
+
+
+class OneEntity(Read):
+    """Reads one entity of a nested layout alone."""
+
+    in_keys = (("s", "cup"),)
+
+    def forward(self, td):
+        return td["s", "cup"][:, :1].expand(-1, 2)
+
+
+def test_data_are_checked_for_an_estimator_that_reads_a_part():
+    states = torch.randn(20, 2, 1)
+    nested = {"s": {"arm": states[:, 0], "cup": states[:, 1]}}
+    rows = TensorDict(
+        {
+            **nested,
+            "episode": torch.zeros(20, dtype=torch.int64),
+            "next": {**nested, "done": torch.zeros(20, 1, dtype=torch.bool)},
+        },
+        [20],
+    )
+    layout = EntityLayout.from_keys({"arm": ("s", "arm"), "cup": ("s", "cup")})
+    with pytest.raises(DatasetError, match="next_equals_state"):
+        score_buffer(filled(rows), OneEntity(layout=layout), smoothing=3)
 
 
 def test_the_progress_bar_counts_rows(capsys):

@@ -54,13 +54,14 @@ def is_native(*tensors: torch.Tensor, sources: Sequence[torch.Tensor] = ()) -> b
         return False
     device = tensors[0].device if tensors else torch.device("cpu")
     for tensor in (*tensors, *sources):
-        if not (
-            type(tensor) in PLAIN
-            and tensor.device == device
-            and tensor.is_contiguous()
-            and not tensor.requires_grad
-            and not (tensor.is_neg() or tensor.is_conj())
-            and (tensor.data_ptr() or not tensor.numel())
+        if (
+            type(tensor) not in PLAIN
+            or tensor.device != device
+            or not tensor.is_contiguous()
+            or tensor.requires_grad
+            or tensor.is_neg()
+            or tensor.is_conj()
+            or (tensor.data_ptr() == 0 and tensor.numel() > 0)
         ):
             return False
     if device.type != "cpu":

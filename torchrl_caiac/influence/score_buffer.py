@@ -169,8 +169,9 @@ def score_buffer(
         overwrite (bool): recompute all scores, whatever the leaf contains. Defaults to
             ``False``.
         check (bool): check a sample of the data first, see
-            :func:`~torchrl_caiac.check_dataset`, if the estimator reads its states.
-            Defaults to ``True``.
+            :func:`~torchrl_caiac.check_dataset`. Defaults to ``True``. Data of which
+            the estimator reads no states of its layout, as simulators do, are not
+            checked.
         progress (bool): show a progress bar. Defaults to ``True``.
         shard (tuple of int, optional): ``(i, n)``, if ``n`` processes, on one machine
             or several, score a folder together, of which this one is number ``i``,

@@ -441,11 +441,11 @@ def reads_state_only(estimator: Any, layout: EntityLayout) -> bool:
 
 
 def reads_state(estimator: Any, layout: EntityLayout) -> bool:
-    """Returns whether an estimator reads the state of a layout.
+    """Returns whether an estimator reads the state of a layout, or a part of it.
 
     The layout of a simulator has the columns of what it computes, not of the data.
     """
-    return set(layout.in_keys) <= set(_in_keys(estimator, layout))
+    return not set(layout.in_keys).isdisjoint(_in_keys(estimator, layout))
 
 
 def to_device_of(estimator: Any, states: TensorDictBase) -> TensorDictBase:

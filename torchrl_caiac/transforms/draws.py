@@ -189,12 +189,17 @@ def uninfluenced(
         tensor([[ True],
                 [False]])
     """
-    if (scores.ndim, scores.dtype) == (2, torch.float32) and not len(scores) % window:
+    if (
+        scores.ndim == 2
+        and scores.dtype is torch.float32
+        and not len(scores) % window
+        and is_native(scores)
+    ):
         limits = _limits(threshold, scores.device)
         if (
             limits.dtype is torch.float32
             and limits.shape in ((), scores.shape[1:])
-            and is_native(scores, limits)
+            and is_native(limits)
         ):
             return free_windows(scores, limits, window)
     return window_max(scores, window) <= threshold

@@ -263,7 +263,7 @@ def test_the_mixture_is_read_once_for_a_sample() -> None:
 
         @mixture.setter
         def mixture(self, value: dict[str, float]) -> None:
-            pass
+            """The constructor sets it."""
 
     goals = Changing(LAYOUT, 1)
     storage = buffer(goals, [5]).storage
