@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 from tensordict import TensorDict, TensorDictBase
 
 from environments.base import Environment
@@ -53,7 +53,8 @@ class OGBench(Environment):
 
     ``env.evaluate.goals`` lists what policies are told: ``all`` goals, which is
     OGBench's evaluation, or ``one`` goal at a time, see
-    :class:`~environments.one_goal.OneGoal`.
+    :class:`~environments.one_goal.OneGoal`. With both, the policy of a run is the one
+    with the highest mean of both on validation starts.
 
     ``env.demonstrations`` is the number of episodes to learn from, the first ones.
     ``held_out`` are rows of episodes with another seed, some steps apart, which only
@@ -77,8 +78,23 @@ class OGBench(Environment):
         if settings.robot_inputs == "position":
             positions = self.layout.positions
             self.inputs = {name: positions[name] for name in self.layout.fixed}
+        goals = settings.evaluate.goals
+        if not (
+            isinstance(goals, ListConfig)
+            and len(goals) == len(set(goals)) > 0
+            and set(goals) <= set(GOALS)
+        ):
+            raise ValueError(
+                f"env.evaluate.goals is {goals!r}, expected a list of some of "
+                f"{list(GOALS)}, each once"
+            )
         if settings.scene.startswith("cube-"):
             self.reward_fn = ogbench_cube_reward
+        elif "one" in goals:
+            raise ValueError(
+                f"env.evaluate.goals is {list(goals)}, but only goals of cubes can be "
+                f"told one at a time, and the scene is {settings.scene}: use [all]"
+            )
         number, collected = settings.demonstrations, settings.collect.episodes
         if number is not None and not 1 <= number <= collected:
             raise ValueError(
@@ -189,11 +205,11 @@ class OGBench(Environment):
         split: Split = "test",
     ) -> list[dict[str, Any]]:
         """Plays the tasks from the same starts for all runs; the splits have others."""
-        torch.manual_seed(seed)
         results = []
         seeds = self._seeds(split)
         self._make_envs(max(map(len, seeds.values())))
         for goals in self.settings.evaluate.goals:
+            torch.manual_seed(seed)  # for each kind, whichever are listed
             told = actor
             if goals == "one":
                 told = OneGoal(actor, self.layout, SCALE * REACHED)
@@ -222,12 +238,6 @@ class OGBench(Environment):
             raise ValueError(
                 f"env.evaluate.tasks is {list(settings.tasks)}, expected some of 1 to "
                 f"{TASKS}"
-            )
-        goals = list(settings.goals)
-        if not goals or len(set(goals)) < len(goals) or not set(goals) <= set(GOALS):
-            raise ValueError(
-                f"env.evaluate.goals is {goals}, expected some of {list(GOALS)}, each "
-                "once"
             )
         first, n = starts[split]
         return {

@@ -8,8 +8,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss, LossModule
 
 from learners.goal_conditioned import GoalConditioned, descend
-from learners.imitation import has_own_goals, imitation_buffer
-from torchrl_caiac.transforms import WindowGoal
+from learners.imitation import future_goals, has_own_goals, imitation_buffer
 
 __all__ = ["BC"]
 
@@ -36,19 +35,13 @@ class BC(GoalConditioned):
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of transitions, their goals, and counterfactuals."""
-        goals = None
-        if not has_own_goals(self.settings):
-            mixture = dict(self.settings.future_goals)
-            offset = {"p": mixture.pop("p")} if "p" in mixture else {}
-            goals = WindowGoal(
-                self.environment.layout, window=self.window, mixture=mixture, **offset
-            )
+        own = has_own_goals(self.settings)
         return imitation_buffer(
             self,
             rows,
             batch_size=self.rows_at_once * self.window,
             window=self.window,
-            goals=goals,
+            goals=None if own else future_goals(self, self.window),
         )
 
     def setup(self, rows: TensorDictBase, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""The buffer that imitation learners sample."""
+"""The buffer of goals that are drawn before the counterfactuals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from learners.base import Learner
 from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.transforms import WindowGoal
 
-__all__ = ["has_own_goals", "imitation_buffer"]
+__all__ = ["future_goals", "has_own_goals", "imitation_buffer"]
 
 
 def has_own_goals(settings: DictConfig) -> bool:
@@ -29,6 +29,15 @@ def has_own_goals(settings: DictConfig) -> bool:
     return bool(settings.goals == "own")
 
 
+def future_goals(learner: Learner, window: int = 1) -> WindowGoal:
+    """Returns what draws later states as goals, by the setting ``future_goals``."""
+    mixture = dict(learner.settings.future_goals)
+    offset = {"p": mixture.pop("p")} if "p" in mixture else {}
+    return WindowGoal(
+        learner.environment.layout, window=window, mixture=mixture, **offset
+    )
+
+
 def imitation_buffer(
     learner: Learner,
     rows: TensorDictBase,
@@ -37,14 +46,14 @@ def imitation_buffer(
     window: int = 1,
     goals: WindowGoal | None = None,
 ) -> TensorDictReplayBuffer:
-    """Creates a buffer of demonstrations: windows, their goals, and counterfactuals.
+    """Creates a buffer of windows, their goals, and counterfactuals.
 
     Goals come before the counterfactuals, whose goals follow the swap: a swapped entity
     takes the goal of its donor.
 
     Args:
         learner (Learner): has the method.
-        rows (TensorDictBase): demonstrations, ``[T]``.
+        rows (TensorDictBase): rows to learn from, ``[T]``.
 
     Keyword Args:
         batch_size (int): rows in a sample, a multiple of ``window``.

@@ -12,11 +12,13 @@ from tensordict.nn import (
     TensorDictModule,
     TensorDictSequential,
 )
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.modules import MLP, IndependentNormal
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from learners.goal_conditioned import descend
 from learners.hindsight import HindsightLearner
+from learners.imitation import future_goals, imitation_buffer
 from torchrl_caiac.modules import GoalConditionedCritic, GoalFeatures
 
 __all__ = ["IQL"]
@@ -59,6 +61,32 @@ class IQL(HindsightLearner):
             self.loss_module.parameters(), lr=settings.lr, fused=True
         )
         self.parts = {"loss": self.loss_module, "optimizer": self.optimizer}
+
+    def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
+        """Makes the buffer; with ``future_goals``, of goals that imitation learns.
+
+        These are drawn before the swap, so that ``lookahead="goal"`` can be used, and
+        an action leads to the goal of every row.
+        """
+        if self.settings.future_goals is None:
+            return super().make_buffer(rows)
+        if self.settings.successful is not None:
+            raise ValueError(
+                f"learner.successful is {self.settings.successful}, but with "
+                "learner.future_goals the goals of episodes do not count: set one of "
+                "them to null"
+            )
+        rb = imitation_buffer(
+            self, rows, batch_size=self.rows_at_once, goals=future_goals(self)
+        )
+        rb.append_transform(self.set_reward)
+        return rb
+
+    def set_reward(self, batch: TensorDictBase) -> TensorDictBase:
+        """Writes the rewards of the goals of a batch."""
+        achieved = self.environment.layout.achieved_goal(batch, next=True)
+        reward = self.environment.reward_fn(achieved, batch["desired_goal"])
+        return batch.set(("next", "reward"), reward.reshape(-1, 1))
 
     def make_distribution(self) -> ProbabilisticTensorDictSequential:
         """Returns the policy as a distribution of actions."""

@@ -176,10 +176,17 @@ def test_goals_are_positions_of_the_cubes(steps, cfg):
     assert len(offsets) > 20 and 0.3 < np.mean(offsets) < 0.7
 
 
+def with_iql(compose, cfg, **learner):
+    whole = compose(
+        "env=ogbench_cube_double_noisy",
+        "learner=iql",
+        "method=[none,motion,distance_action]",
+    )
+    return OmegaConf.merge(whole, {"out": cfg.out, "env": cfg.env, "learner": learner})
+
+
 def test_learners_of_values_sample_all_episodes(steps, compose, cfg):
-    small = {"out": cfg.out, "env": cfg.env}
-    whole = compose("env=ogbench_cube_double_noisy", "learner=iql", "method=[none]")
-    cfg = OmegaConf.merge(whole, small)
+    cfg = with_iql(compose, cfg, future_goals=None)
     assert cfg.learner.successful is None and cfg.learner.gamma == 0.99
     made = steps.parts.make_learner(cfg, "none")
     rb = made.make_buffer(made.rows())
@@ -191,6 +198,29 @@ def test_learners_of_values_sample_all_episodes(steps, compose, cfg):
     cfg.learner.successful = 0.7
     made = steps.parts.make_learner(cfg, "none")
     with pytest.raises(ValueError, match=r"learner.successful is 0.7.*null"):
+        made.make_buffer(made.rows())
+
+
+def test_goals_of_iql_are_drawn_before_the_swap(steps, compose, cfg):
+    cfg = with_iql(compose, cfg)
+    assert cfg.learner.future_goals == {"uniform": 1.0}
+    cfg.env.augmentation.lookahead = "goal"
+    cfg.learner.future_goals = {"geometric": 1.0, "p": 0.5}
+    steps.fit.fit(cfg)
+    steps.score.score(cfg)
+    made = steps.parts.make_learner(cfg, "distance_action")
+    made.check_strides()
+    batch = made.make_buffer(made.rows()).sample()
+    columns = [c + i for c in CUBES for i in range(3)]
+    achieved = batch["next", "observation"][:, columns]
+    goals = batch["desired_goal"]
+    reward = ogbench_cube_reward(achieved, goals)
+    assert torch.equal(batch["next", "reward"][:, 0], reward)
+    assert -0.99 < reward.mean() < 0  # the next state is the goal of half of the rows
+    assert batch["caiac", "swapped"].any()
+    cfg.learner.successful = 0.7
+    made = steps.parts.make_learner(cfg, "none")
+    with pytest.raises(ValueError, match=r"successful is 0.7, but .*future_goals"):
         made.make_buffer(made.rows())
 
 
@@ -273,6 +303,46 @@ def test_one_goal_is_told_at_a_time(steps):
     assert told[1][2].tolist() == goals[2].tolist()
 
 
+def test_a_goal_is_chosen_after_all_were_reached(steps):
+    from environments.one_goal import OneGoal
+
+    told = []
+
+    def actor(td):
+        told.append(td["desired_goal"].tolist()[0])
+        return TensorDict({}, td.batch_size)
+
+    policy = OneGoal(actor, ready_layout("ogbench/cube-double"), tolerance=0.4)
+    goals = torch.tensor([[0.0, 0, 1, 0, 0, 0]])
+    state = torch.zeros(1, 37)
+    state[0, 21] = 1.0
+    td = TensorDict({"observation": state, "desired_goal": goals}, [1])
+    carried = policy(td)["next"]
+    state[0, 19] = state[0, 28] = 2.0  # both have moved; the second one's is lower
+    policy(td.update(carried))
+    assert told == [[0, 0, 1, 0, 0, 0], [2, 0, 1, 0, 0, 0]]
+    with pytest.raises(ValueError, match=r"env.evaluate.goals=\[all\]"):
+        OneGoal(actor, ready_layout("ogbench/scene"), tolerance=0.4)
+
+
+def test_a_random_policy_plays_the_same_whichever_goals_are_listed(
+    steps, compose, tmp_path
+):
+    class Random(Still):
+        def __call__(self, td):
+            self.seen.append(torch.randn(1))
+            return super().__call__(td)
+
+    first = []
+    for kinds in (["one"], ["all", "one"]):
+        cfg = compose("env=ogbench_cube_double_play", out=tmp_path)
+        cfg = changed(cfg, evaluate={"tasks": [1], "episodes": 1, "goals": kinds})
+        actor = Random(most=-1)
+        steps.parts.make_environment(cfg).play(actor, 0, tmp_path)
+        first.append([actor.seen[0], actor.seen[-2 * 500]])
+    assert len({float(x) for pair in first for x in pair}) == 1
+
+
 def test_tasks_are_played_with_one_goal_too(steps, compose, tmp_path):
     cfg = compose("env=ogbench_cube_double_play", out=tmp_path)
     cfg = changed(cfg, evaluate={"tasks": [5], "goals": ["all", "one"]})
@@ -311,9 +381,6 @@ def test_starts_depend_on_the_split_alone(steps, compose, tmp_path):
         ({"validation_seed": 1_000_009}, "change validation_seed"),
         ({"tasks": [0, 1]}, r"expected some of 1 to 5"),
         ({"tasks": []}, r"expected some of 1 to 5"),
-        ({"goals": []}, r"goals is \[\], expected some of"),
-        ({"goals": ["all", "all"]}, "each once"),
-        ({"goals": ["two"]}, r"expected some of \['all', 'one'\]"),
     ],
 )
 def test_wrong_settings_of_the_evaluation(wrong, match, steps, compose, tmp_path):
@@ -323,6 +390,27 @@ def test_wrong_settings_of_the_evaluation(wrong, match, steps, compose, tmp_path
         environment.play(Still(), 0, tmp_path)
     with pytest.raises(ValueError, match="split is 'train'"):
         environment.play(Still(), 0, tmp_path, split="train")
+
+
+@pytest.mark.parametrize(
+    ("scene", "goals", "match"),
+    [
+        ("cube-double", [], r"goals is \[\], expected a list of some of"),
+        ("cube-double", ["all", "all"], "each once"),
+        ("cube-double", ["two"], r"a list of some of \['all', 'one'\]"),
+        ("cube-double", "one", "goals is 'one', expected a list"),
+        ("cube-double", None, "goals is None, expected a list"),
+        ("scene", ["all", "one"], r"only goals of cubes .* scene is scene: use \[all"),
+    ],
+)
+def test_wrong_goals_are_refused_before_anything_else(
+    scene, goals, match, steps, compose, tmp_path
+):
+    cfg = compose("env=ogbench_cube_double_play", out=tmp_path)
+    cfg = changed(cfg, scene=scene)
+    cfg.env.evaluate.goals = goals
+    with pytest.raises(ValueError, match=match):
+        steps.parts.make_environment(cfg)
 
 
 def test_methods_score_the_rows(steps, cfg):

@@ -451,18 +451,23 @@ def test_data_are_checked_by_a_layout_of_their_own_states(caplog):
         score_buffer(filled(rows), Outcomes(), progress=False)
 
 
-class OneEntity(Read):
-    """Reads one entity of a nested layout alone."""
+class Part(Read):
+    """Reads a part of a nested state."""
 
-    in_keys = (("s", "cup"),)
+    def __init__(self, layout, in_keys):
+        super().__init__(layout=layout)
+        self.in_keys = in_keys
 
     def forward(self, td):
-        return td["s", "cup"][:, :1].expand(-1, 2)
+        return torch.zeros(len(td), 2)
 
 
-def test_data_are_checked_for_an_estimator_that_reads_a_part():
+@pytest.mark.parametrize(
+    "key", [("s", "cup"), ("s", "cup", "x"), "s", ("next", "s", "cup", "x")]
+)
+def test_data_are_checked_for_an_estimator_that_reads_a_part(key):
     states = torch.randn(20, 2, 1)
-    nested = {"s": {"arm": states[:, 0], "cup": states[:, 1]}}
+    nested = {"s": {"arm": states[:, 0], "cup": {"x": states[:, 1]}}}
     rows = TensorDict(
         {
             **nested,
@@ -473,7 +478,29 @@ def test_data_are_checked_for_an_estimator_that_reads_a_part():
     )
     layout = EntityLayout.from_keys({"arm": ("s", "arm"), "cup": ("s", "cup")})
     with pytest.raises(DatasetError, match="next_equals_state"):
-        score_buffer(filled(rows), OneEntity(layout=layout), smoothing=3)
+        score_buffer(filled(rows), Part(layout, [key]), smoothing=3)
+
+
+def test_the_last_next_state_is_scored_by_a_part_of_it():
+    states = torch.arange(21.0).view(-1, 1)
+    before, after = (
+        {"s": {"arm": x, "cup": {"x": x}}} for x in (states[:-1], states[1:])
+    )
+    done = torch.zeros(20, 1, dtype=torch.bool)
+    rows = TensorDict({**before, "next": {**after, "done": done}}, [20])
+    layout = EntityLayout.from_keys({"arm": ("s", "arm"), "cup": ("s", "cup")})
+
+    class Cup(Part):
+        def forward(self, td):
+            return td["s", "cup", "x"].expand(-1, 2)
+
+    found = []
+    for keys in (layout.in_keys, [("s", "cup")], [("s", "cup", "x")]):
+        rb = filled(rows.clone())
+        score_buffer(rb, Cup(layout, keys), smoothing=3, trajectory_key=None)
+        found.append(rb[:]["caiac", "score"])
+    assert found[0][-1, 0] > 19  # the mean of the last states
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
 def test_the_progress_bar_counts_rows(capsys):

@@ -252,6 +252,7 @@ def score_buffer(
     is_prepared = False
     for number in range(_MOST_PASSES):
         index = trajectory_index(rb, trajectory_key=trajectory_key, done_key=done_key)
+        # The layout of a simulator has the columns of what it computes.
         if check and not number and reads_state(estimator, layout):
             check_before_use(
                 rb,

@@ -12,7 +12,7 @@ from torch import nn
 
 from torchrl_caiac._fingerprints import fingerprint, state_hash
 from torchrl_caiac._kernels import UsedKernels, only_kernels
-from torchrl_caiac._keys import as_key, missing_key
+from torchrl_caiac._keys import as_key, missing_key, path
 from torchrl_caiac._spread import spread_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.smoothing import fill_between, max_ahead, smooth
@@ -436,16 +436,27 @@ def layout_of(estimator: Any) -> EntityLayout:
 
 
 def reads_state_only(estimator: Any, layout: EntityLayout) -> bool:
-    """Returns whether an estimator reads nothing but the state of a layout."""
-    return set(_in_keys(estimator, layout)) <= set(layout.in_keys)
+    """Returns whether an estimator reads nothing but the state, or parts of it."""
+    return all(
+        any(_is_below(key, state) for state in layout.in_keys)
+        for key in _in_keys(estimator, layout)
+    )
 
 
 def reads_state(estimator: Any, layout: EntityLayout) -> bool:
-    """Returns whether an estimator reads the state of a layout, or a part of it.
+    """Returns whether an estimator reads the state, the next one, or parts of them."""
+    states = [*layout.in_keys, *map(layout.next, layout.in_keys)]
+    return any(
+        _is_below(key, state) or _is_below(state, key)
+        for key in _in_keys(estimator, layout)
+        for state in states
+    )
 
-    The layout of a simulator has the columns of what it computes, not of the data.
-    """
-    return not set(layout.in_keys).isdisjoint(_in_keys(estimator, layout))
+
+def _is_below(key: NestedKey, other: NestedKey) -> bool:
+    """Returns whether a key is that of an entry, or of a part of it."""
+    parts = path(other)
+    return path(key)[: len(parts)] == parts
 
 
 def to_device_of(estimator: Any, states: TensorDictBase) -> TensorDictBase:

@@ -393,11 +393,12 @@ def apply_swap(
     outside = (rows < 0) | (rows >= length)
     if trajectories is not None and window > 1:
         steps = torch.arange(window, device=device).view(-1, 1)
+        # A row of no trajectory has no later ones; it becomes `length` below.
         rows = trajectories.later(rows.masked_fill(outside, 0).unsqueeze(1), steps)
         outside = outside.unsqueeze(1)
     rows = rows.masked_fill(outside, length)  # reading it raises
     width = max((leaf.width for leaf in plan.leaves), default=0)
-    if (length + window) * width < 1 << 31:
+    if (length + window) * width < 1 << 31:  # with rows after `length`, in windows
         rows = rows.int()  # half as much to write and to read
     places: dict[int, torch.Tensor] = {}
     masks: dict[tuple[int, int], torch.Tensor] = {}

@@ -17,6 +17,7 @@ from torchrl.data import (
     ListStorage,
     ReplayBuffer,
     SliceSampler,
+    TensorStorage,
 )
 
 from torchrl_caiac import EntityLayout
@@ -272,23 +273,64 @@ def test_the_mixture_is_read_once_for_a_sample() -> None:
     assert goals.times == before + 1
 
 
-@pytest.mark.parametrize("base", [WindowGoal, HindsightGoal])
-def test_a_subclass_reads_its_own_goals(base: type[FutureGoal]) -> None:
+def zeros(base: type[FutureGoal]) -> type[FutureGoal]:
+    """A subclass that reads its own goals."""
+
     class Zeros(base):
         def read_goals(self, data, rows=None):
             found = super().read_goals(data, rows)
             return {key: torch.zeros_like(goal) for key, goal in found.items()}
 
+    return Zeros
+
+
+@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize(
+    ("base", "options"),
+    [
+        (WindowGoal, {"window": 1}),
+        (HindsightGoal, {"future": 1.0}),
+        (HindsightGoal, {"future": 0.0, "random": 1.0}),
+    ],
+)
+def test_a_subclass_reads_its_own_goals(
+    base: type[FutureGoal], options: dict[str, float], native: bool
+) -> None:
     data = make([9])
     data["desired_goal"] = torch.ones(9, 2)
     data["next", "reward"] = torch.zeros(9, 1)
-    options = {"window": 1}
     if base is HindsightGoal:
-        options = {"reward_fn": lambda achieved, goal: achieved[:, 0], "future": 1.0}
-    goals = Zeros(LAYOUT, **options)
+        options = {"reward_fn": lambda achieved, goal: achieved[:, 0] - 1, **options}
+    goals = zeros(base)(LAYOUT, **options)
     rb = offline_buffer(data, 30, sample_unit=goals)
     rb.append_transform(goals)
-    assert not rb.sample()["desired_goal"].any()
+    with nullcontext() if native else only_torch():
+        for _ in range(3):  # the second batch is relabelled by fewer calls
+            batch = rb.sample()
+            assert not batch["desired_goal"].any()
+            if base is HindsightGoal:
+                assert (batch["next", "reward"] == -1).all()
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_a_subclass_reads_its_own_goals_of_donors(nested: bool) -> None:
+    layout = NESTED if nested else LAYOUT
+    data, goal = make([9], nested), {"x": torch.ones(9, 1), "y": torch.ones(9, 1)}
+    if nested:
+        data["g", "cup"] = TensorDict(goal, [9])
+    else:
+        data["desired_goal"] = torch.ones(9, 2)
+    swap = CAIACTransform(
+        layout,
+        donors=TensorStorage(data),
+        goals=zeros(WindowGoal)(layout, 1),
+        counterfactual_ratio=1.0,
+        check=False,
+    )
+    out = swap(data)
+    assert out["caiac", "swapped"][:, 1].all()
+    found = out["g", "cup"].values() if nested else [out["desired_goal"]]
+    assert not any(leaf.any() for leaf in found)
 
 
 def test_last_respects_writes_and_the_cursor() -> None:

@@ -329,7 +329,8 @@ class HindsightGoal(FutureGoal):
     def _relabel(self, td: TensorDictBase, draw: HindsightDraw) -> Goals:
         """Returns the leaves that a draw changes or adds."""
         flags = leaf_of(td, self.keys.counterfactual)
-        found = self._relabel_vectors(td, draw) if self.layout.is_flat else None
+        is_flat = self.layout.is_flat and self.reads_by_layout
+        found = self._relabel_vectors(td, draw) if is_flat else None
         goals: Goals = {}
         if found is None:
             goals, reached, relabeled = self._relabel_leaves(td, draw)
@@ -481,7 +482,7 @@ class HindsightGoal(FutureGoal):
         """Returns what relabels batches like this one, if it can."""
         own, base = type(self), HindsightGoal
         if (
-            not self.layout.is_flat
+            not (self.layout.is_flat and self.reads_by_layout)
             or own.generate_parameters is not base.generate_parameters
             or own.apply_parameters is not base.apply_parameters
         ):

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._batches import with_leaves
-from torchrl_caiac._keys import path
+from torchrl_caiac._keys import join, path
 from torchrl_caiac._sampling import window_goals
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex, flat_rows
@@ -196,9 +196,9 @@ class WindowGoal(FutureGoal):
         """Reads goals by one function of C; ``None`` where it cannot."""
         if LateCheck.needed(rows.device):  # the function raises at once
             return None
-        drawn = numbers[1:]
-        own = [x for x in drawn if x is not None]
-        source = self.source_in_c(data, trajectories, rows, *own)
+        drawn = numbers.chance, numbers.share, numbers.steps
+        given = [x for x in drawn if x is not None]
+        source = self.source_in_c(data, trajectories, rows, *given)
         if source is None:
             return None
         bounds = [(STRATEGIES.index(name), least) for name, least in numbers.bounds]
@@ -278,18 +278,24 @@ class WindowGoal(FutureGoal):
             torch.Tensor: ``[C, G]``, or ``[C, ...]`` for one entity.
         """
         if isinstance(owner, torch.Tensor):
+            rows = rows.gather(1, owner.to(rows.device).expand(rows.shape[0], -1))
+            if not self.reads_by_layout:
+                (goals,) = self.read_goals(donors, rows.flatten()).values()
+                return goals.unflatten(0, rows.shape).diagonal(dim1=1, dim2=2)
             source = self.flat_source(donors)
             where = self.goal_index(source.device)
-            rows = rows.gather(1, owner.to(rows.device).expand(rows.shape[0], -1))
             places = rows.to(source.device) * source.shape[-1] + where
             return pick_places(source, places.flatten()).view(places.shape)
         name = self.layout.names[owner]
         base = self.layout.goal[name]
-        source = self.nested_source(donors, name)
         below = _below(key, base, self.layout.next(base))
+        rows = rows[:, owner]
+        if not self.reads_by_layout:
+            return self.read_goals(donors, rows)[join(base, *below)]
+        source = self.nested_source(donors, name)
         if below:
             source = plain_tensor(source.get(below))
-        return pick_rows(source, rows[:, owner])
+        return pick_rows(source, rows)
 
     # --- writing ---------------------------------------------------------------------
 
