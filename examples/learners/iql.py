@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import copy
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    TensorDictSequential,
 )
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.modules import MLP, IndependentNormal
+from torchrl.modules import IndependentNormal
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from learners.goal_conditioned import descend
 from learners.hindsight import HindsightLearner
 from learners.imitation import future_goals, imitation_buffer
-from torchrl_caiac.modules import GoalConditionedCritic, GoalFeatures
+from torchrl_caiac.modules import GoalConditionedCritic, GoalConditionedValue
 
 __all__ = ["IQL"]
 
@@ -49,7 +46,9 @@ class IQL(HindsightLearner):
                 )
                 for _ in range(2)
             ],
-            self.make_value(features),
+            GoalConditionedValue(
+                features, tuple(settings.hidden_sizes), hidden_dtype=self.hidden_dtype
+            ),
             loss_function="l2",
             temperature=settings.temperature,
             expectile=settings.expectile,
@@ -99,19 +98,6 @@ class IQL(HindsightLearner):
             ProbabilisticTensorDictModule(
                 ["loc", "scale"], ["action"], distribution_class=IndependentNormal
             ),
-        )
-
-    def make_value(self, features: GoalFeatures) -> TensorDictSequential:
-        """Returns the value of a state and a goal."""
-        network = MLP(
-            features.width,
-            1,
-            num_cells=list(self.settings.hidden_sizes),
-            activation_class=torch.nn.ReLU,
-        )
-        return TensorDictSequential(
-            copy.deepcopy(features),
-            TensorDictModule(network, features.out_keys, ["state_value"]),
         )
 
     def step(self, batch: TensorDictBase, step: int) -> dict[str, torch.Tensor]:

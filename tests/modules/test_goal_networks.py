@@ -1,4 +1,4 @@
-"""Tests of the goal-conditioned policy and action value."""
+"""Tests of the goal-conditioned policy, action values and state values."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.modules import (
     GoalConditionedActor,
     GoalConditionedCritic,
+    GoalConditionedValue,
     GoalFeatures,
 )
 from torchrl_caiac.modules import goal_networks as networks_module
@@ -226,6 +227,37 @@ def test_nested_keys():
     td = critic(actor(td))
     torch.testing.assert_close(nested[key], td["action"])
     torch.testing.assert_close(nested["agent", "q"], td["state_action_value"])
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@pytest.mark.parametrize("dtype", [None, torch.bfloat16])
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_state_values_are_action_values_without_actions(batch, dtype, layer_norm):
+    features = GoalFeatures(LAYOUT, reference="arm").fit_statistics(rows(200))
+    options = {"hidden_dtype": dtype, "layer_norm": layer_norm}
+    value = GoalConditionedValue(features, (32, 16), out_key=("agent", "v"), **options)
+    critic = GoalConditionedCritic(features, 1, (32, 16), **options)
+    weights = value.network.state_dict()
+    first = critic.network.state_dict()["0.weight"]
+    first[:, :-1], first[:, -1] = weights["0.weight"], 0.0
+    critic.network.load_state_dict({**weights, "0.weight": first})
+    td = rows(*batch).exclude("action")
+    assert value.in_keys == ["observation", "desired_goal"]
+    found = value(td.clone())
+    assert found["agent", "v"].shape == (*batch, 1)
+    td["action"] = torch.randn(*batch, 1)
+    expected = critic(td)["state_action_value"]
+    # bfloat16 sums are rounded in another order.
+    atol = 1e-6 if dtype is None else 0.02
+    torch.testing.assert_close(found["agent", "v"], expected, atol=atol, rtol=0)
+    dispatched = value(observation=td["observation"], desired_goal=td["desired_goal"])
+    assert torch.equal(dispatched, found["agent", "v"])
+
+
+@pytest.mark.parametrize("size", [(), (16, 0)])
+def test_bad_sizes_of_state_values(size):
+    with pytest.raises(ValueError, match="hidden_sizes"):
+        GoalConditionedValue(GoalFeatures(LAYOUT), size)
 
 
 @pytest.mark.parametrize("cls", [GoalConditionedActor, GoalConditionedCritic])

@@ -9,6 +9,7 @@ from torchrl_caiac.modules.goal_features import GoalFeatures
 from torchrl_caiac.modules.goal_networks import (
     GoalConditionedActor,
     GoalConditionedCritic,
+    GoalConditionedValue,
 )
 from torchrl_caiac.modules.linear import faster_dtype
 from torchrl_caiac.modules.lmp import LMPModel
@@ -21,6 +22,7 @@ __all__ = [
     "GaussianWorldModel",
     "GoalConditionedActor",
     "GoalConditionedCritic",
+    "GoalConditionedValue",
     "GoalFeatures",
     "LMPActor",
     "LMPModel",

@@ -1,4 +1,4 @@
-"""Goal-conditioned policies and action values for TD3."""
+"""Goal-conditioned policies, action values and state values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchrl_caiac._keys import as_key
 from torchrl_caiac.modules.goal_features import GoalFeatures, read_leaves
 from torchrl_caiac.modules.linear import linear
 
-__all__ = ["GoalConditionedActor", "GoalConditionedCritic"]
+__all__ = ["GoalConditionedActor", "GoalConditionedCritic", "GoalConditionedValue"]
 
 
 class _CastLinear(nn.Linear):
@@ -331,6 +331,77 @@ class GoalConditionedCritic(TensorDictModuleBase):
         features = self.features.forward_tensors(observation, goal, of_features)
         inputs = torch.cat([features, action.to(features.dtype)], -1)
         return tensordict.set(self.out_keys[0], self.network(inputs, of_network))
+
+
+class GoalConditionedValue(TensorDictModuleBase):
+    """A state value ``V(s, g)``: features, then a ReLU network.
+
+    For losses such as TorchRL's :class:`~torchrl.objectives.IQLLoss`.
+
+    Args:
+        features (GoalFeatures): the input of the network. It is copied: fit its
+            statistics first.
+        hidden_sizes (sequence of int): the widths of the hidden layers. Defaults to
+            three layers of 256.
+
+    Keyword Args:
+        hidden_dtype (torch.dtype, optional): as in :class:`GoalConditionedActor`.
+        layer_norm (bool): as in :class:`GoalConditionedCritic`. Defaults to ``False``.
+        out_key (NestedKey): where the value is written, ``[*B, 1]``. Defaults to
+            ``"state_value"``.
+
+    Raises:
+        ValueError: a size is not a positive int.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.modules import GoalConditionedValue, GoalFeatures
+        >>> layout = EntityLayout(
+        ...     {"cube": [0, 1]}, goal={"cube": [0]}, achieved={"cube": [0]}
+        ... )
+        >>> value = GoalConditionedValue(GoalFeatures(layout), (16, 16))
+        >>> td = TensorDict(
+        ...     {"observation": torch.randn(5, 2), "desired_goal": torch.randn(5, 1)},
+        ...     [5],
+        ... )
+        >>> value(td)["state_value"].shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        features: GoalFeatures,
+        hidden_sizes: Sequence[int] = (256, 256, 256),
+        *,
+        hidden_dtype: torch.dtype | None = None,
+        layer_norm: bool = False,
+        out_key: NestedKey = "state_value",
+    ) -> None:
+        super().__init__()
+        self.features = copy.deepcopy(features)
+        self.network = _mlp(features.width, 1, hidden_sizes, hidden_dtype, layer_norm)
+        self.in_keys = list(features.in_keys)
+        self.out_keys = [as_key(out_key)]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the value.
+
+        Args:
+            tensordict (TensorDictBase): states ``[*B, D]`` and goals ``[*B, G]``.
+
+        Returns:
+            TensorDictBase: the same tensordict, with the value ``[*B, 1]``.
+
+        Raises:
+            KeyError: an input is missing.
+            ValueError: the state or the goal has the wrong width.
+        """
+        observation, goal = read_leaves(tensordict, self.in_keys)
+        features = self.features.forward_tensors(observation, goal)
+        return tensordict.set(self.out_keys[0], self.network(features))
 
 
 def takes_params(network: nn.Module) -> bool:
