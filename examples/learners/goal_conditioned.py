@@ -23,7 +23,8 @@ class GoalConditioned(Learner):
     """A policy ``π(s, g)`` that reads :class:`~torchrl_caiac.modules.GoalFeatures`.
 
     It needs the settings ``steps``, ``checkpoint_every``, ``batch_size``,
-    ``batches_at_once``, ``hidden_sizes`` and ``hidden_dtype``.
+    ``batches_at_once``, ``hidden_sizes`` and ``hidden_dtype``; ``policy_sizes`` are the
+    hidden layers of the policy, if they differ.
     """
 
     rb: ReplayBuffer
@@ -58,7 +59,7 @@ class GoalConditioned(Learner):
         return GoalConditionedActor(
             features,
             self.environment.action_dim,
-            tuple(self.settings.hidden_sizes),
+            tuple(self.settings.get("policy_sizes") or self.settings.hidden_sizes),
             hidden_dtype=self.hidden_dtype,
             action_key=action_key,
         )

@@ -109,16 +109,20 @@ class HindsightLearner(GoalConditioned):
         """
         return self._make_buffer(rows, self.settings.get("successful"))
 
+    def check_rewards(self) -> None:
+        """Raises if the environment has no rewards for goals."""
+        if self.environment.reward_fn is None:
+            raise ValueError(
+                f"learner={self.settings.name} needs rewards for goals, which "
+                f"{type(self.environment).__name__} does not have: set its reward_fn, "
+                "or choose another learner"
+            )
+
     def _make_buffer(
         self, rows: TensorDictBase, share: float | None
     ) -> TensorDictReplayBuffer:
         environment = self.environment
-        if environment.reward_fn is None:
-            raise ValueError(
-                f"learner={self.settings.name} needs rewards for goals, which "
-                f"{type(environment).__name__} does not have: set its reward_fn, or "
-                "choose another learner"
-            )
+        self.check_rewards()
         augmentation = self.counterfactuals()
         ratio = self.augmentation.counterfactual_ratio
         random = 0.5 if self.settings.get("random_goals", True) else 0.0

@@ -60,6 +60,18 @@ class IQL(HindsightLearner):
             self.loss_module.parameters(), lr=settings.lr, fused=True
         )
         self.parts = {"loss": self.loss_module, "optimizer": self.optimizer}
+        self.scheduler = None
+        if settings.decay_steps is not None:
+            if settings.decay_steps < settings.steps:
+                raise ValueError(
+                    f"learner.decay_steps is {settings.decay_steps}, expected at least "
+                    f"learner.steps, {settings.steps}: the learning rate would rise "
+                    "again"
+                )
+            self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(
+                self.optimizer, settings.decay_steps
+            )
+            self.parts["scheduler"] = self.scheduler
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer; with ``future_goals``, of goals that imitation learns.
@@ -69,6 +81,7 @@ class IQL(HindsightLearner):
         """
         if self.settings.future_goals is None:
             return super().make_buffer(rows)
+        self.check_rewards()
         if self.settings.successful is not None:
             raise ValueError(
                 f"learner.successful is {self.settings.successful}, but with "
@@ -107,6 +120,8 @@ class IQL(HindsightLearner):
         losses = self.loss_module(batch)
         names = ("loss_actor", "loss_qvalue", "loss_value")
         descend(self.optimizer, sum(losses[name] for name in names))
+        if self.scheduler is not None:
+            self.scheduler.step()
         self.updater.step()
         scalars = {name: losses[name].detach() for name in names}
         return scalars | self.share_swapped(batch)

@@ -371,12 +371,32 @@ def test_no_goals_of_other_rows(method, configure, steps):
         assert rows["episode"][own] == rows["episode"][goal] and goal >= own
 
 
-def test_values_need_rewards(configure, steps, monkeypatch):
-    cfg = configure("fetch_push", "iql")
+@pytest.mark.parametrize("goals", ["null", "{uniform:1.0}"])
+def test_values_need_rewards(goals, configure, steps, monkeypatch):
+    cfg = configure("fetch_push", "iql", f"learner.future_goals={goals}")
     kind = type(steps.parts.make_environment(cfg))
     monkeypatch.setattr(kind, "reward_fn", None)
     with pytest.raises(ValueError, match="learner=iql needs rewards for goals"):
         make(steps, cfg)
+
+
+def test_the_learning_rate_of_iql_falls_and_its_policy_has_own_sizes(configure, steps):
+    options = ["learner.decay_steps=6", "learner.steps=6", "learner.policy_sizes=[24]"]
+    made = make(steps, configure("fetch_push", "iql", *options))
+    rates, batches = [], made.batches()
+    for step in range(1, 7):
+        made.step(next(batches), step)
+        rates.append(made.optimizer.param_groups[0]["lr"])
+    # One step remains after each of them.
+    expected = [0.5e-3 * (1 + math.cos(math.pi * step / 6)) for step in range(1, 7)]
+    assert rates == pytest.approx(expected, abs=1e-12)
+    assert "scheduler" in made.parts
+    policy = made.load_policy(made.policy_state())
+    widths = [x.shape[0] for n, x in policy.network.state_dict().items() if "bias" in n]
+    assert widths == [24, 4]
+    options[1] = "learner.steps=8"
+    with pytest.raises(ValueError, match=r"decay_steps is 6, .* learner.steps, 8"):
+        make(steps, configure("fetch_push", "iql", *options))
 
 
 class TestChunkActor:
