@@ -56,10 +56,11 @@ class GoalConditioned(Learner):
         self, features: GoalFeatures, action_key: NestedKey = "action"
     ) -> GoalConditionedActor:
         """Returns the policy."""
+        sizes = self.settings.get("policy_sizes")
         return GoalConditionedActor(
             features,
             self.environment.action_dim,
-            tuple(self.settings.get("policy_sizes") or self.settings.hidden_sizes),
+            tuple(self.settings.hidden_sizes if sizes is None else sizes),
             hidden_dtype=self.hidden_dtype,
             action_key=action_key,
         )

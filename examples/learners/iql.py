@@ -94,6 +94,12 @@ class IQL(HindsightLearner):
         rb.append_transform(self.set_reward)
         return rb
 
+    def make_online_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
+        """Makes the buffer of collected rows, with the same goals."""
+        if self.settings.future_goals is None:
+            return super().make_online_buffer(rows)
+        return self.make_buffer(rows)
+
     def set_reward(self, batch: TensorDictBase) -> TensorDictBase:
         """Writes the rewards of the goals of a batch."""
         achieved = self.environment.layout.achieved_goal(batch, next=True)

@@ -218,6 +218,9 @@ def test_goals_of_iql_are_drawn_before_the_swap(steps, compose, cfg):
     assert torch.equal(batch["next", "reward"][:, 0], reward)
     assert -0.99 < reward.mean() < 0  # the next state is the goal of half of the rows
     assert batch["caiac", "swapped"].any()
+    online = made.make_online_buffer(made.rows()).sample()
+    assert set(online.keys(True)) == set(batch.keys(True))
+    assert ("hindsight", "relabeled") not in online.keys(True)
     cfg.learner.successful = 0.7
     made = steps.parts.make_learner(cfg, "none")
     with pytest.raises(ValueError, match=r"successful is 0.7, but .*future_goals"):

@@ -329,8 +329,9 @@ class HindsightGoal(FutureGoal):
     def _relabel(self, td: TensorDictBase, draw: HindsightDraw) -> Goals:
         """Returns the leaves that a draw changes or adds."""
         flags = leaf_of(td, self.keys.counterfactual)
-        is_flat = self.layout.is_flat and self.reads_by_layout
-        found = self._relabel_vectors(td, draw) if is_flat else None
+        found = None
+        if self.layout.is_flat and self.reads_by_layout:
+            found = self._relabel_vectors(td, draw)
         goals: Goals = {}
         if found is None:
             goals, reached, relabeled = self._relabel_leaves(td, draw)
