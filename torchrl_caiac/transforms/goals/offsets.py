@@ -188,13 +188,17 @@ def strategy_bounds(mixture: Mapping[str, float]) -> list[tuple[str, float]]:
             f"mixture maps strategies among {list(STRATEGIES)} to weights, got "
             f"{mixture}"
         )
-    total, below, found = sum(mixture.values()), 0.0, []
-    if not all(weight >= 0 for weight in mixture.values()) or not 0 < total < math.inf:
+    try:
+        weights = {name: float(weight) for name, weight in mixture.items()}
+    except (TypeError, ValueError, OverflowError):
+        weights = {}
+    total, below, found = sum(weights.values()), 0.0, []
+    if not all(weight >= 0 for weight in weights.values()) or not 0 < total < math.inf:
         raise ValueError(
             "the weights of mixture are at least 0, and their sum is positive and "
             f"finite; got {mixture}"
         )
-    for name, weight in mixture.items():
+    for name, weight in weights.items():
         if weight > 0:
             found.append((name, below / total))
             below += weight
