@@ -36,7 +36,7 @@ from torchrl.modules import AdditiveGaussianModule
 from environments.fetch_push import FetchPush
 from score import make_scoring
 from shared.console import Console
-from shared.parts import make_environment, run_folder
+from shared.parts import make_environment, make_learner, run_folder
 from shared.settings import keep_settings
 from study import prepare
 from torchrl_caiac._figures import colour, finish_results, new_figure
@@ -144,6 +144,8 @@ def run(cfg: DictConfig, method: str, seed: int) -> Iterator[dict[str, Any]]:
     settings = cfg.online
     folder = run_folder(cfg, method, seed) / f"online-{settings.episodes}"
     folder.mkdir(parents=True, exist_ok=True)
+    whole = cfg.learner.steps + settings.rounds * settings.steps
+    make_learner(cfg, method).check(whole)
     learner: Any = train(cfg, method, seed)
     if not isinstance(learner.environment, FetchPush):
         raise ValueError("online.py collects in Fetch-Push only: set env=fetch_push")

@@ -7,9 +7,10 @@ from tensordict import TensorDict
 from torchrl_caiac._keys import as_key, floating, get_leaf, missing_key
 
 
-def test_no_key():
-    with pytest.raises(TypeError, match="a str or a tuple of str, got 3"):
-        as_key(3)
+@pytest.mark.parametrize("key", [3, (), ("a", 1), ("a", ()), (("a", None), "b")])
+def test_no_key(key):
+    with pytest.raises(TypeError, match="a str or a tuple of str, got"):
+        as_key(key)
 
 
 def test_get_leaf_names_what_is_there_and_what_to_do():

@@ -38,9 +38,16 @@ def as_key(key: Any) -> NestedKey:
         >>> as_key((("next", "observation"),)), as_key(("done",))
         (('next', 'observation'), 'done')
     """
-    if not isinstance(key, (str, tuple)):
+    if not _is_key(key):
         raise TypeError(f"a key must be a str or a tuple of str, got {key!r}")
     return unravel_key(key)
+
+
+def _is_key(key: Any) -> bool:
+    # unravel_key leaves out what is not a str.
+    return isinstance(key, str) or (
+        isinstance(key, tuple) and bool(key) and all(map(_is_key, key))
+    )
 
 
 def path(key: NestedKey) -> tuple[str, ...]:

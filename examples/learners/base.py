@@ -119,8 +119,14 @@ class Learner(ABC):
         number = self.settings.get("batches_at_once")
         return 1 if number is None else int(number)
 
-    def check_strides(self) -> None:
-        """Raises if a run could stop in the middle of a sample."""
+    def check(self, steps: int | None = None) -> None:
+        """Raises if a setting is wrong, before anything is read or written.
+
+        Here: if a run could stop in the middle of a sample.
+
+        Args:
+            steps (int, optional): of the whole run. Defaults to ``settings.steps``.
+        """
         if self.at_once < 1:
             raise ValueError(
                 f"learner.batches_at_once is {self.at_once}, expected at least 1"

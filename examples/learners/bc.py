@@ -24,6 +24,12 @@ class BC(GoalConditioned):
     window = 1
     """Rows that follow each other, from which a row to learn from is made."""
 
+    def check(self, steps: int | None = None) -> None:
+        """Raises if a setting is wrong; see the base class."""
+        super().check(steps)
+        if not has_own_goals(self.settings):
+            future_goals(self, self.window)  # or raises
+
     def stored_rows(self) -> TensorDictBase:
         """Returns the demonstrations."""
         return self.environment.demonstrations()

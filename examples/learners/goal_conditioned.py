@@ -7,6 +7,7 @@ from itertools import islice
 from typing import Any
 
 import torch
+from omegaconf import ListConfig
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
@@ -30,12 +31,26 @@ class GoalConditioned(Learner):
     rb: ReplayBuffer
     actor: GoalConditionedActor
 
+    def check(self, steps: int | None = None) -> None:
+        """Raises if a setting is wrong; see the base class."""
+        super().check(steps)
+        for name in ("hidden_sizes", "policy_sizes"):
+            sizes = self.settings.get(name)
+            if sizes is None and name == "policy_sizes":
+                continue
+            if not isinstance(sizes, ListConfig) or not all(
+                type(size) is int and size > 0 for size in [*sizes] or [None]
+            ):
+                raise ValueError(
+                    f"learner.{name} is {sizes!r}, expected a list of the widths of "
+                    "hidden layers, integers from 1 on"
+                )
+
     def start(self, rows: TensorDictBase, seed: int) -> GoalFeatures:
         """Makes the buffer; returns features with the statistics of some batches.
 
         All methods of a seed then create the same networks.
         """
-        self.check_strides()
         torch.manual_seed(seed)
         self.rb = self.make_buffer(rows)
         features = self.make_features()

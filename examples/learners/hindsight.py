@@ -84,6 +84,16 @@ class HindsightLearner(GoalConditioned):
         *[("next", name) for name in ("reward", "terminated")],
     )
 
+    def check(self, steps: int | None = None) -> None:
+        """Raises if a setting is wrong; see the base class."""
+        super().check(steps)
+        if self.environment.reward_fn is None:
+            raise ValueError(
+                f"learner={self.settings.name} needs rewards for goals, which "
+                f"{type(self.environment).__name__} does not have: set its reward_fn, "
+                "or choose another learner"
+            )
+
     def rows(self) -> TensorDictBase:
         """Returns what learning reads, in memory."""
         return self.learning_rows(self.environment.goal_rows())
@@ -109,20 +119,10 @@ class HindsightLearner(GoalConditioned):
         """
         return self._make_buffer(rows, self.settings.get("successful"))
 
-    def check_rewards(self) -> None:
-        """Raises if the environment has no rewards for goals."""
-        if self.environment.reward_fn is None:
-            raise ValueError(
-                f"learner={self.settings.name} needs rewards for goals, which "
-                f"{type(self.environment).__name__} does not have: set its reward_fn, "
-                "or choose another learner"
-            )
-
     def _make_buffer(
         self, rows: TensorDictBase, share: float | None
     ) -> TensorDictReplayBuffer:
         environment = self.environment
-        self.check_rewards()
         augmentation = self.counterfactuals()
         ratio = self.augmentation.counterfactual_ratio
         random = 0.5 if self.settings.get("random_goals", True) else 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from omegaconf import DictConfig
@@ -30,12 +31,30 @@ def has_own_goals(settings: DictConfig) -> bool:
 
 
 def future_goals(learner: Learner, window: int = 1) -> WindowGoal:
-    """Returns what draws later states as goals, by the setting ``future_goals``."""
-    mixture = dict(learner.settings.future_goals)
+    """Returns what draws later states as goals, by the setting ``future_goals``.
+
+    Raises:
+        ValueError: the setting is not a mixture of strategies.
+    """
+    given = learner.settings.future_goals
+    wanted = "weights of strategies, and p of geometric offsets"
+    if not isinstance(given, Mapping):
+        raise ValueError(f"learner.future_goals is {given!r}, expected {wanted}")
+    mixture = dict(given)
     offset = {"p": mixture.pop("p")} if "p" in mixture else {}
-    return WindowGoal(
-        learner.environment.layout, window=window, mixture=mixture, **offset
-    )
+    if offset and not mixture.get("geometric"):
+        raise ValueError(
+            f"learner.future_goals is {given}, expected {wanted}: without geometric "
+            "offsets p has no effect"
+        )
+    try:
+        return WindowGoal(
+            learner.environment.layout, window=window, mixture=mixture, **offset
+        )
+    except ValueError as error:
+        raise ValueError(
+            f"learner.future_goals is {given}, expected {wanted}: {error}"
+        ) from error
 
 
 def imitation_buffer(

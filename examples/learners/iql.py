@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import math
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import (
@@ -17,8 +21,15 @@ from learners.goal_conditioned import descend
 from learners.hindsight import HindsightLearner
 from learners.imitation import future_goals, imitation_buffer
 from torchrl_caiac.modules import GoalConditionedCritic, GoalConditionedValue
+from torchrl_caiac.transforms import TransformKeys
+from torchrl_caiac.transforms.rewards import GoalLeaves, goal_vectors
 
 __all__ = ["IQL"]
+
+
+def _number(value: Any) -> float:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if is_number else math.nan
 
 
 class IQL(HindsightLearner):
@@ -28,6 +39,38 @@ class IQL(HindsightLearner):
     a squashed one, actions at their bounds, as experts prefer them, are infinitely
     unlikely.
     """
+
+    def check(self, steps: int | None = None) -> None:
+        """Raises if a setting is wrong; see the base class."""
+        super().check(steps)
+        settings = self.settings
+        if not 0 <= _number(settings.temperature) < math.inf:
+            raise ValueError(
+                f"learner.temperature is {settings.temperature!r}, expected a number "
+                "from 0 on"
+            )
+        if not 0 < _number(settings.expectile) < 1:
+            raise ValueError(
+                f"learner.expectile is {settings.expectile!r}, expected a number "
+                "between 0 and 1"
+            )
+        steps = settings.steps if steps is None else steps
+        decay = settings.decay_steps
+        if decay is not None and (type(decay) is not int or decay < max(steps, 1)):
+            raise ValueError(
+                f"learner.decay_steps is {decay!r}, expected null or an integer from "
+                f"{steps} on, the steps of the whole run: later the learning rate "
+                "would rise again"
+            )
+        if settings.future_goals is not None:
+            future_goals(self)  # or raises
+            for name, off in (("successful", None), ("random_goals", False)):
+                if settings.get(name) not in (None, False):
+                    raise ValueError(
+                        f"learner.{name} is {settings[name]}, but has no effect with "
+                        f"learner.future_goals: set it to {json.dumps(off)}, or "
+                        "learner.future_goals to null"
+                    )
 
     def setup(self, rows: TensorDictBase, seed: int) -> None:
         """Makes policy, values and action values, with statistics of some batches."""
@@ -62,12 +105,6 @@ class IQL(HindsightLearner):
         self.parts = {"loss": self.loss_module, "optimizer": self.optimizer}
         self.scheduler = None
         if settings.decay_steps is not None:
-            if settings.decay_steps < settings.steps:
-                raise ValueError(
-                    f"learner.decay_steps is {settings.decay_steps}, expected at least "
-                    f"learner.steps, {settings.steps}: the learning rate would rise "
-                    "again"
-                )
             self.scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(
                 self.optimizer, settings.decay_steps
             )
@@ -81,17 +118,16 @@ class IQL(HindsightLearner):
         """
         if self.settings.future_goals is None:
             return super().make_buffer(rows)
-        self.check_rewards()
-        if self.settings.successful is not None:
-            raise ValueError(
-                f"learner.successful is {self.settings.successful}, but with "
-                "learner.future_goals the goals of episodes do not count: set one of "
-                "them to null"
-            )
+        layout = self.environment.layout
+        leaves = GoalLeaves(self.environment.reward_fn, None, keys=TransformKeys())
+
+        def set_rewards(batch: TensorDictBase) -> TensorDictBase:
+            return batch.update(leaves(batch, *goal_vectors(batch, layout)))
+
         rb = imitation_buffer(
             self, rows, batch_size=self.rows_at_once, goals=future_goals(self)
         )
-        rb.append_transform(self.set_reward)
+        rb.append_transform(set_rewards)
         return rb
 
     def make_online_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
@@ -99,12 +135,6 @@ class IQL(HindsightLearner):
         if self.settings.future_goals is None:
             return super().make_online_buffer(rows)
         return self.make_buffer(rows)
-
-    def set_reward(self, batch: TensorDictBase) -> TensorDictBase:
-        """Writes the rewards of the goals of a batch."""
-        achieved = self.environment.layout.achieved_goal(batch, next=True)
-        reward = self.environment.reward_fn(achieved, batch["desired_goal"])
-        return batch.set(("next", "reward"), reward.reshape(-1, 1))
 
     def make_distribution(self) -> ProbabilisticTensorDictSequential:
         """Returns the policy as a distribution of actions."""

@@ -49,7 +49,6 @@ class LMP(Learner):
     def setup(self, rows: TensorDictBase, seed: int) -> None:
         """Makes the model, with the statistics of the rows."""
         settings = self.settings
-        self.check_strides()
         torch.manual_seed(seed)
         self.model = self.make_model()
         goals = self.environment.layout.achieved_goal(rows, next=True)

@@ -62,15 +62,17 @@ def make_methods(cfg: DictConfig) -> dict[str, Method]:
 
 def make_learner(cfg: DictConfig, method: str) -> Learner:
     """Returns the learner ``cfg.learner`` for one of the methods."""
-    if cfg.learner.get("hidden_dtype") == "auto":
-        cfg = cfg.copy()
-        cfg.learner.hidden_dtype = hidden_dtype(cfg)
-    return get_class(cfg.learner._target_)(
+    cfg = cfg.copy()
+    learner: Learner = get_class(cfg.learner._target_)(
         cfg.learner,
         make_environment(cfg),
         make_method(cfg, method),
         cfg.env.augmentation,
     )
+    learner.check()
+    if cfg.learner.get("hidden_dtype") == "auto":
+        learner.settings.hidden_dtype = hidden_dtype(cfg)
+    return learner
 
 
 def hidden_dtype(cfg: DictConfig) -> str:
@@ -82,7 +84,8 @@ def hidden_dtype(cfg: DictConfig) -> str:
     path = make_environment(cfg).folder / cfg.runs / "hidden_dtype.json"
     if not path.exists():
         settings = cfg.learner
-        dtype = faster_dtype(settings.batch_size, max(settings.hidden_sizes))
+        widths = [*settings.hidden_sizes, *(settings.get("policy_sizes") or [])]
+        dtype = faster_dtype(settings.batch_size, max(widths))
         write_json(path, {"hidden_dtype": str(dtype).removeprefix("torch.")})
     return str(read_json(path, "dtype of hidden layers", "delete it")["hidden_dtype"])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from itertools import product
 from types import SimpleNamespace
 
@@ -371,7 +372,7 @@ def test_no_goals_of_other_rows(method, configure, steps):
         assert rows["episode"][own] == rows["episode"][goal] and goal >= own
 
 
-@pytest.mark.parametrize("goals", ["null", "{uniform:1.0}"])
+@pytest.mark.parametrize("goals", ["null", "{uniform: 1.0}"])
 def test_values_need_rewards(goals, configure, steps, monkeypatch):
     cfg = configure("fetch_push", "iql", f"learner.future_goals={goals}")
     kind = type(steps.parts.make_environment(cfg))
@@ -394,9 +395,57 @@ def test_the_learning_rate_of_iql_falls_and_its_policy_has_own_sizes(configure, 
     policy = made.load_policy(made.policy_state())
     widths = [x.shape[0] for n, x in policy.network.state_dict().items() if "bias" in n]
     assert widths == [24, 4]
-    options[1] = "learner.steps=8"
-    with pytest.raises(ValueError, match=r"decay_steps is 6, .* learner.steps, 8"):
-        make(steps, configure("fetch_push", "iql", *options))
+    with pytest.raises(ValueError, match=r"decay_steps is 6, expected .* from 8 on"):
+        made.check(8)
+
+
+@pytest.mark.parametrize(
+    ("learner", "option", "match"),
+    [
+        ("iql", "decay_steps=7", "learner.decay_steps is 7, expected .* from 8 on"),
+        ("iql", "decay_steps=.nan", "learner.decay_steps is nan"),
+        ("iql", "decay_steps=1e5", "learner.decay_steps is 100000.0"),
+        ("iql", "decay_steps=soon", "learner.decay_steps is 'soon'"),
+        ("iql", "temperature=-1", "learner.temperature is -1"),
+        ("iql", "temperature=null", "learner.temperature is None"),
+        ("iql", "expectile=1", "learner.expectile is 1"),
+        ("iql", "policy_sizes=[]", r"learner.policy_sizes is \[\]"),
+        ("iql", "policy_sizes=16", "learner.policy_sizes is 16"),
+        ("td3", "hidden_sizes=[true]", r"learner.hidden_sizes is \[True\]"),
+        ("iql", "future_goals=uniform", "learner.future_goals is 'uniform'"),
+        ("iql", "future_goals={p: 0.3}", "without geometric offsets p has no effect"),
+        ("iql", "future_goals={geometric: 1.0, p: null}", "future_goals .* got None"),
+        ("iql", "future_goals={uniform: 1.0}", "learner.successful .* has no effect"),
+        (
+            "iql",
+            "future_goals={uniform: 1.0} successful=null random_goals=true",
+            "learner.random_goals is True, but has no effect .* set it to false",
+        ),
+        ("bc", "future_goals={first: 1.0} goals=future", "future_goals .* strategies"),
+    ],
+)
+def test_wrong_settings_are_refused_before_anything_is_written(
+    learner, option, match, configure, steps
+):
+    options = ["learner.steps=8"]
+    options += [f"learner.{part}" for part in re.split(r" (?=\w+=)", option)]
+    cfg = configure("fetch_push", learner, *options)
+    with pytest.raises(ValueError, match=match):
+        steps.train.train(cfg, "motion", 0)
+    assert not steps.parts.run_folder(cfg, "motion", 0).exists()
+
+
+def test_rewards_of_future_goals_are_checked(configure, steps, monkeypatch):
+    options = ["learner.future_goals={uniform: 1.0}", "learner.successful=null"]
+    cfg = configure("fetch_push", "iql", *options)
+    made = steps.parts.make_learner(cfg, "motion")
+    rb = made.make_buffer(made.rows())
+    assert (rb.sample()["next", "reward"].shape) == (made.rows_at_once, 1)
+    kind = type(made.environment)
+    monkeypatch.setattr(kind, "reward_fn", staticmethod(lambda new, goals: new[:, :2]))
+    rb = made.make_buffer(made.rows())
+    with pytest.raises(ValueError, match="reward_fn returned"):
+        rb.sample()
 
 
 class TestChunkActor:

@@ -50,6 +50,14 @@ def test_rounds_collect_score_and_resume(cfg, steps, monkeypatch):
     assert len(collected) == 1
 
 
+def test_the_learning_rate_must_not_rise_again_online(compose, steps, tmp_path):
+    cfg = compose("learner=iql", config="online", out=tmp_path)
+    cfg.learner.update({"steps": 8, "decay_steps": 8})
+    cfg.online.update({"rounds": 2, "steps": 3})
+    with pytest.raises(ValueError, match=r"decay_steps is 8, expected .* from 14 on"):
+        next(steps.online.run(cfg, "none", 0))
+
+
 def test_results_of_a_run_replace_those_before(steps, tmp_path):
     row = dict.fromkeys(steps.online.COLUMNS, 1)
     other = row | {"seed": 2}

@@ -254,7 +254,7 @@ def test_state_values_are_action_values_without_actions(batch, dtype, layer_norm
     assert torch.equal(dispatched, found["agent", "v"])
 
 
-@pytest.mark.parametrize("size", [(), (16, 0)])
+@pytest.mark.parametrize("size", [(), (16, 0), 16, None, (True,)])
 def test_bad_sizes_of_state_values(size):
     with pytest.raises(ValueError, match="hidden_sizes"):
         GoalConditionedValue(GoalFeatures(LAYOUT), size)
@@ -269,11 +269,21 @@ def test_bad_sizes_of_state_values(size):
         ((2, ()), {}, "hidden_sizes"),
         ((2, (16, 0)), {}, "hidden_sizes"),
         ((2, (16,)), {"hidden_dtype": torch.int8}, "hidden_dtype"),
+        ((2, (16,)), {"hidden_dtype": "bfloat16"}, "hidden_dtype"),
     ],
 )
 def test_bad_arguments(cls, args, kwargs, match):
     with pytest.raises(ValueError, match=match):
         cls(GoalFeatures(LAYOUT), *args, **kwargs)
+
+
+@pytest.mark.parametrize("features", [None, LAYOUT, torch.nn.Linear(1, 1)])
+def test_other_features(features):
+    for cls in (GoalConditionedActor, GoalConditionedCritic):
+        with pytest.raises(TypeError, match="features must be GoalFeatures"):
+            cls(features, 2)
+    with pytest.raises(TypeError, match="features must be GoalFeatures"):
+        GoalConditionedValue(features)
 
 
 def test_bad_bounds():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 
 import torch
@@ -113,28 +113,36 @@ def _mlp(
     hidden_dtype: torch.dtype | None,
     layer_norm: bool = False,
 ) -> _MLP:
-    hidden_sizes = list(hidden_sizes)
-    if not hidden_sizes or any(
-        not isinstance(size, int) or size < 1 for size in hidden_sizes
-    ):
+    sizes = list(hidden_sizes) if isinstance(hidden_sizes, Iterable) else []
+    if not sizes or any(type(size) is not int or size < 1 for size in sizes):
         raise ValueError(
             "hidden_sizes must have the width of at least one hidden layer, each an "
             f"int of at least 1, got {hidden_sizes!r}"
         )
-    if hidden_dtype is not None and not hidden_dtype.is_floating_point:
+    if hidden_dtype is not None and not (
+        isinstance(hidden_dtype, torch.dtype) and hidden_dtype.is_floating_point
+    ):
         raise ValueError(
-            f"hidden_dtype must be a floating point dtype, got {hidden_dtype}"
+            f"hidden_dtype must be a floating point torch.dtype, got {hidden_dtype!r}"
         )
     hidden = {"compute_dtype": hidden_dtype, "relu": True, "layer_norm": layer_norm}
     return _MLP(
         in_features,
         out_features,
-        num_cells=hidden_sizes,
+        num_cells=sizes,
         activation_class=nn.Identity,  # the layers apply ReLU themselves
         layer_class=_CastLinear,
         # The last layer computes values and actions, in the dtype of the weights.
-        layer_kwargs=[*[hidden] * len(hidden_sizes), {}],
+        layer_kwargs=[*[hidden] * len(sizes), {}],
     )
+
+
+def _copied(features: GoalFeatures) -> GoalFeatures:
+    if not isinstance(features, GoalFeatures):
+        raise TypeError(
+            f"features must be GoalFeatures(layout), got {type(features).__name__}"
+        )
+    return copy.deepcopy(features)
 
 
 class GoalConditionedActor(TensorDictModuleBase):
@@ -200,7 +208,7 @@ class GoalConditionedActor(TensorDictModuleBase):
         low, high = (torch.as_tensor(x).float().expand(action_dim) for x in (low, high))
         if not (low < high).all():
             raise ValueError(f"low must be below high, got {low} and {high}")
-        self.features = copy.deepcopy(features)
+        self.features = _copied(features)
         self.network = _mlp(features.width, action_dim, hidden_sizes, hidden_dtype)
         self.register_buffer("low", low.clone())
         self.register_buffer("span", high - low)
@@ -258,7 +266,8 @@ class GoalConditionedCritic(TensorDictModuleBase):
             ``"state_action_value"``.
 
     Raises:
-        ValueError: a size is not a positive int.
+        TypeError: ``features`` are not goal features.
+        ValueError: a size is not a positive int, or a dtype no floating point one.
 
     Examples:
         >>> import torch
@@ -296,7 +305,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
         check_int("action_dim", action_dim, 1)
         # A loss stacks the buffers of its critics. Shared ones would become views of
         # one memory, to which load_state_dict cannot write.
-        self.features = copy.deepcopy(features)
+        self.features = _copied(features)
         self.network = _mlp(
             features.width + action_dim, 1, hidden_sizes, hidden_dtype, layer_norm
         )
@@ -351,7 +360,8 @@ class GoalConditionedValue(TensorDictModuleBase):
             ``"state_value"``.
 
     Raises:
-        ValueError: a size is not a positive int.
+        TypeError: ``features`` are not goal features.
+        ValueError: a size is not a positive int, or a dtype no floating point one.
 
     Examples:
         >>> import torch
@@ -380,7 +390,7 @@ class GoalConditionedValue(TensorDictModuleBase):
         out_key: NestedKey = "state_value",
     ) -> None:
         super().__init__()
-        self.features = copy.deepcopy(features)
+        self.features = _copied(features)
         self.network = _mlp(features.width, 1, hidden_sizes, hidden_dtype, layer_norm)
         self.in_keys = list(features.in_keys)
         self.out_keys = [as_key(out_key)]

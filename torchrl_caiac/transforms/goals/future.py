@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from numbers import Real
 from typing import Any
 
 import torch
@@ -55,7 +56,7 @@ class FutureGoal(RandomTransform, SampleUnit):
     ) -> None:
         super().__init__(check_generator(generator))
         check_layout(layout)
-        if not 0 < p <= 1:
+        if not isinstance(p, Real) or not 0 < p <= 1:
             raise ValueError(
                 f"p, of the geometric strategy, must be in (0, 1], got {p!r}"
             )
