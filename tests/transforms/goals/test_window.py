@@ -424,6 +424,8 @@ def test_a_clone_has_its_own_mixture() -> None:
         ({"mixture": {"last": "much"}}, "weights of mixture"),
         ({"mixture": {"last": None}}, "weights of mixture"),
         ({"p": 0.0}, r"must be in \(0, 1\]"),
+        ({"p": None}, r"must be in \(0, 1\]"),
+        ({"p": "0.3"}, r"must be in \(0, 1\]"),
         ({"p": 1.1}, r"must be in \(0, 1\]"),
         ({"layout": EntityLayout({"cup": [0]})}, "no goals"),
         (

@@ -56,7 +56,8 @@ class FutureGoal(RandomTransform, SampleUnit):
     ) -> None:
         super().__init__(check_generator(generator))
         check_layout(layout)
-        if not isinstance(p, Real) or not 0 < p <= 1:
+        is_number: bool = isinstance(p, Real)
+        if not is_number or not 0 < p <= 1:
             raise ValueError(
                 f"p, of the geometric strategy, must be in (0, 1], got {p!r}"
             )
