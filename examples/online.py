@@ -142,10 +142,10 @@ def success(
 def run(cfg: DictConfig, method: str, seed: int) -> Iterator[dict[str, Any]]:
     """Trains offline and then online; yields the success before and after."""
     settings = cfg.online
-    folder = run_folder(cfg, method, seed) / f"online-{settings.episodes}"
-    folder.mkdir(parents=True, exist_ok=True)
     whole = cfg.learner.steps + settings.rounds * settings.steps
     make_learner(cfg, method).check(whole)
+    folder = run_folder(cfg, method, seed) / f"online-{settings.episodes}"
+    folder.mkdir(parents=True, exist_ok=True)
     learner: Any = train(cfg, method, seed)
     if not isinstance(learner.environment, FetchPush):
         raise ValueError("online.py collects in Fetch-Push only: set env=fetch_push")
