@@ -467,6 +467,11 @@ class TestFiles:
             (run.learner, run.method) for run in runs
         }
         assert all(run.cfg.out.endswith("_quick") for run in small)
+        if study.publish is not None:  # what is committed is of the settings of today
+            results = steps.results
+            rows = results.read_rows(EXAMPLES.parent / study.publish / f"{name}.csv")
+            assert rows and not results.unlisted(runs, rows)
+            assert "stale" not in {results.state_of(run, rows) for run in runs}
 
     @pytest.mark.parametrize(
         ("changes", "message"),
