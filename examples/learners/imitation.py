@@ -51,7 +51,7 @@ def future_goals(learner: Learner, window: int = 1) -> WindowGoal:
         return WindowGoal(
             learner.environment.layout, window=window, mixture=mixture, **offset
         )
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(
             f"learner.future_goals is {given}, expected {wanted}: {error}"
         ) from error

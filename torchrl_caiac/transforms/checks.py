@@ -54,7 +54,10 @@ def check_number(name: str, value: Any, high: float) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
     if not 0 <= number <= high or not math.isfinite(number):
         limits = f"in [0, {high:g}]" if math.isfinite(high) else "finite, at least 0"
         raise ValueError(f"{name} must be {limits}, got {value!r}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import threading
-from numbers import Real
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.trajectory_cache import TrajectoryCache
-from torchrl_caiac.transforms.checks import check_generator, check_layout
+from torchrl_caiac.transforms.checks import check_generator, check_layout, check_number
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 
@@ -56,8 +56,7 @@ class FutureGoal(RandomTransform, SampleUnit):
     ) -> None:
         super().__init__(check_generator(generator))
         check_layout(layout)
-        is_number: bool = isinstance(p, Real)
-        if not is_number or not 0 < p <= 1:
+        if not 0 < check_number("p", p, math.inf) <= 1:
             raise ValueError(
                 f"p, of the geometric strategy, must be in (0, 1], got {p!r}"
             )

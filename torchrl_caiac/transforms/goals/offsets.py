@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from torchrl_caiac._random import draw_numbers
+from torchrl_caiac.transforms.checks import check_number
 
 __all__ = [
     "STRATEGIES",
@@ -71,6 +72,7 @@ def draw_goal_offset(
         torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
 
     Raises:
+        TypeError: a weight is not a number.
         ValueError: the mixture has an unknown strategy or a wrong weight.
 
     Examples:
@@ -108,6 +110,7 @@ def draw_goal_numbers(
         GoalNumbers: the numbers that the strategies need.
 
     Raises:
+        TypeError: a weight is not a number.
         ValueError: the mixture has an unknown strategy or a wrong weight.
 
     Examples:
@@ -175,6 +178,7 @@ def strategy_bounds(mixture: Mapping[str, float]) -> list[tuple[str, float]]:
         list of tuple: strategies and bounds, ascending from 0.
 
     Raises:
+        TypeError: a weight is not a number.
         ValueError: the mixture has an unknown strategy or a wrong weight.
 
     Examples:
@@ -188,15 +192,14 @@ def strategy_bounds(mixture: Mapping[str, float]) -> list[tuple[str, float]]:
             f"mixture maps strategies among {list(STRATEGIES)} to weights, got "
             f"{mixture}"
         )
-    try:
-        weights = {name: float(weight) for name, weight in mixture.items()}
-    except (TypeError, ValueError, OverflowError):
-        weights = {}
+    weights = {
+        name: check_number(f"the weight of {name!r} in mixture", weight, math.inf)
+        for name, weight in mixture.items()
+    }
     total, below, found = sum(weights.values()), 0.0, []
-    if not all(weight >= 0 for weight in weights.values()) or not 0 < total < math.inf:
+    if not 0 < total < math.inf:
         raise ValueError(
-            "the weights of mixture are at least 0, and their sum is positive and "
-            f"finite; got {mixture}"
+            f"the weights of mixture must have a positive, finite sum, got {mixture}"
         )
     for name, weight in weights.items():
         if weight > 0:
