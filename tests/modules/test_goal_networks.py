@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from unittest import mock
 
@@ -254,7 +255,9 @@ def test_state_values_are_action_values_without_actions(batch, dtype, layer_norm
     assert torch.equal(dispatched, found["agent", "v"])
 
 
-@pytest.mark.parametrize("size", [(), (16, 0), 16, None, (True,)])
+@pytest.mark.parametrize(
+    "size", [(), (16, 0), 16, None, (True,), b"\x08", {16: 1}, {16}]
+)
 def test_bad_sizes_of_state_values(size):
     with pytest.raises(ValueError, match="hidden_sizes"):
         GoalConditionedValue(GoalFeatures(LAYOUT), size)
@@ -270,6 +273,7 @@ def test_bad_sizes_of_state_values(size):
         ((2, (16, 0)), {}, "hidden_sizes"),
         ((2, (16,)), {"hidden_dtype": torch.int8}, "hidden_dtype"),
         ((2, (16,)), {"hidden_dtype": "bfloat16"}, "hidden_dtype"),
+        ((2, (16,)), {"hidden_dtype": torch.float8_e4m3fn}, "hidden_dtype"),
     ],
 )
 def test_bad_arguments(cls, args, kwargs, match):
@@ -286,9 +290,32 @@ def test_other_features(features):
         GoalConditionedValue(features)
 
 
-def test_bad_bounds():
-    with pytest.raises(ValueError, match="below high"):
-        GoalConditionedActor(GoalFeatures(LAYOUT), 2, low=1.0, high=1.0)
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        (1.0, 1.0),
+        (-math.inf, math.inf),
+        (-3e38, 3e38),  # the width of the range is infinite
+        (math.nan, 1.0),
+        (None, 1.0),
+        ("a", 1.0),
+        (torch.zeros(3), 1.0),
+    ],
+)
+def test_bad_bounds(low, high):
+    with pytest.raises(
+        ValueError, match=r"low and high must be .* \[2\], low below high"
+    ):
+        GoalConditionedActor(GoalFeatures(LAYOUT), 2, low=low, high=high)
+
+
+def test_a_policy_on_the_meta_device():
+    with torch.device("meta"):
+        empty = GoalConditionedActor(GoalFeatures(LAYOUT), 2, (16,), high=2.0)
+    assert {x.device.type for x in empty.state_dict().values()} == {"meta"}
+    actor = GoalConditionedActor(GoalFeatures(LAYOUT), 2, (16,), high=2.0)
+    empty.load_state_dict(actor.state_dict(), assign=True)
+    assert torch.equal(empty(rows(4))["action"], actor(rows(4))["action"])
 
 
 def test_bad_goals():

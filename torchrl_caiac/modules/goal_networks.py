@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 
 import torch
@@ -20,6 +20,9 @@ from torchrl_caiac.modules.goal_features import GoalFeatures, read_leaves
 from torchrl_caiac.modules.linear import linear
 
 __all__ = ["GoalConditionedActor", "GoalConditionedCritic", "GoalConditionedValue"]
+
+
+_DTYPES = torch.float32, torch.bfloat16, torch.float16, torch.float64
 
 
 class _CastLinear(nn.Linear):
@@ -113,17 +116,16 @@ def _mlp(
     hidden_dtype: torch.dtype | None,
     layer_norm: bool = False,
 ) -> _MLP:
-    sizes = list(hidden_sizes) if isinstance(hidden_sizes, Iterable) else []
+    is_sequence = isinstance(hidden_sizes, Sequence) and type(hidden_sizes) is not bytes
+    sizes = list(hidden_sizes) if is_sequence else []
     if not sizes or any(type(size) is not int or size < 1 for size in sizes):
         raise ValueError(
-            "hidden_sizes must have the width of at least one hidden layer, each an "
-            f"int of at least 1, got {hidden_sizes!r}"
+            "hidden_sizes must be a sequence of the widths of at least one hidden "
+            f"layer, each an int of at least 1, got {hidden_sizes!r}"
         )
-    if hidden_dtype is not None and not (
-        isinstance(hidden_dtype, torch.dtype) and hidden_dtype.is_floating_point
-    ):
+    if hidden_dtype not in (None, *_DTYPES):
         raise ValueError(
-            f"hidden_dtype must be a floating point torch.dtype, got {hidden_dtype!r}"
+            f"hidden_dtype must be None or one of {list(_DTYPES)}, got {hidden_dtype!r}"
         )
     hidden = {"compute_dtype": hidden_dtype, "relu": True, "layer_norm": layer_norm}
     return _MLP(
@@ -143,6 +145,27 @@ def _copied(features: GoalFeatures) -> GoalFeatures:
             f"features must be GoalFeatures(layout), got {type(features).__name__}"
         )
     return copy.deepcopy(features)
+
+
+def _low_and_span(
+    low: float | torch.Tensor, high: float | torch.Tensor, size: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the smallest action and the width of its range, each ``[size]``."""
+    try:  # on the CPU, since a value of a meta device cannot be compared
+        least, most = (
+            torch.as_tensor(x, dtype=torch.float32, device="cpu").expand(size).clone()
+            for x in (low, high)
+        )
+    except (TypeError, ValueError, RuntimeError):
+        least = most = torch.zeros(size, device="cpu")
+    span = most - least
+    if not ((span > 0) & span.isfinite()).all():
+        raise ValueError(
+            "low and high must be finite numbers or tensors of shape "
+            f"[{size}], low below high; got {low!r} and {high!r}"
+        )
+    device = torch.get_default_device()
+    return least.to(device), span.to(device)
 
 
 class GoalConditionedActor(TensorDictModuleBase):
@@ -170,7 +193,9 @@ class GoalConditionedActor(TensorDictModuleBase):
             ``"action"``.
 
     Raises:
-        ValueError: a size is not a positive int, or ``low`` is not below ``high``.
+        TypeError: ``features`` are not goal features.
+        ValueError: a size is not a positive int, a dtype not one of float16, bfloat16,
+            float32 and float64, or ``low`` and ``high`` are not finite bounds.
 
     Examples:
         >>> import torch
@@ -205,13 +230,11 @@ class GoalConditionedActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         check_int("action_dim", action_dim, 1)
-        low, high = (torch.as_tensor(x).float().expand(action_dim) for x in (low, high))
-        if not (low < high).all():
-            raise ValueError(f"low must be below high, got {low} and {high}")
         self.features = _copied(features)
         self.network = _mlp(features.width, action_dim, hidden_sizes, hidden_dtype)
-        self.register_buffer("low", low.clone())
-        self.register_buffer("span", high - low)
+        low, span = _low_and_span(low, high, action_dim)
+        self.register_buffer("low", low)
+        self.register_buffer("span", span)
         self.in_keys = list(features.in_keys)
         self.out_keys = [as_key(action_key)]
 
@@ -267,7 +290,7 @@ class GoalConditionedCritic(TensorDictModuleBase):
 
     Raises:
         TypeError: ``features`` are not goal features.
-        ValueError: a size is not a positive int, or a dtype no floating point one.
+        ValueError: a size or a dtype is wrong, as in :class:`GoalConditionedActor`.
 
     Examples:
         >>> import torch
@@ -361,7 +384,7 @@ class GoalConditionedValue(TensorDictModuleBase):
 
     Raises:
         TypeError: ``features`` are not goal features.
-        ValueError: a size is not a positive int, or a dtype no floating point one.
+        ValueError: a size or a dtype is wrong, as in :class:`GoalConditionedActor`.
 
     Examples:
         >>> import torch

@@ -30,6 +30,7 @@ from torchrl_caiac.transforms import (
     WindowGoal,
 )
 from torchrl_caiac.transforms.goals.future import FutureGoal
+from torchrl_caiac.transforms.goals.offsets import draw_goal_offset
 
 LAYOUT = EntityLayout(
     {"arm": [0], "cup": [1, 2]},
@@ -442,6 +443,18 @@ def test_arguments(arguments: dict, match: str) -> None:
 def test_weights_and_p_are_numbers(arguments: dict) -> None:
     with pytest.raises(TypeError, match="must be a number, got"):
         WindowGoal(LAYOUT, 2, **arguments)
+
+
+@pytest.mark.parametrize("mixture", ["last", ["last"], 5])
+def test_a_mixture_is_a_mapping(mixture) -> None:
+    with pytest.raises(TypeError, match="mixture must map strategies"):
+        WindowGoal(LAYOUT, 2, mixture=mixture)
+
+
+@pytest.mark.parametrize("p", [0.0, 2.0, math.nan])
+def test_the_parameter_of_drawn_offsets_is_checked(p: float) -> None:
+    with pytest.raises(ValueError, match="p"):
+        draw_goal_offset(torch.tensor([4]), {"geometric": 1.0}, p=p)
 
 
 def test_window_is_an_int() -> None:

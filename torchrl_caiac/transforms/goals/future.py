@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from typing import Any
 
@@ -19,7 +18,8 @@ from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.trajectories import TrajectoryIndex
 from torchrl_caiac.trajectory_cache import TrajectoryCache
-from torchrl_caiac.transforms.checks import check_generator, check_layout, check_number
+from torchrl_caiac.transforms.checks import check_generator, check_layout
+from torchrl_caiac.transforms.goals.offsets import check_probability
 from torchrl_caiac.transforms.indexing import pick_places, pick_rows, plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
 
@@ -56,10 +56,7 @@ class FutureGoal(RandomTransform, SampleUnit):
     ) -> None:
         super().__init__(check_generator(generator))
         check_layout(layout)
-        if not 0 < check_number("p", p, math.inf) <= 1:
-            raise ValueError(
-                f"p, of the geometric strategy, must be in (0, 1], got {p!r}"
-            )
+        self.p = check_probability(p)
         if not any(layout.goal.values()):
             raise ValueError(
                 "the layout has no goals: give EntityLayout(..., goal=..., "
@@ -77,7 +74,6 @@ class FutureGoal(RandomTransform, SampleUnit):
                     "give EntityLayout.from_keys(..., achieved=...)"
                 )
         self.layout = layout
-        self.p = float(p)
         self.keys = keys or TransformKeys()
         if layout.is_flat and layout.achieved:
             key: NestedKey = layout.next(layout.observation_key)

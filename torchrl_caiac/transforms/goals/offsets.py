@@ -14,6 +14,7 @@ from torchrl_caiac.transforms.checks import check_number
 __all__ = [
     "STRATEGIES",
     "GoalNumbers",
+    "check_probability",
     "draw_goal_numbers",
     "draw_goal_offset",
     "draw_steps",
@@ -41,6 +42,30 @@ class GoalNumbers(NamedTuple):
     chance: torch.Tensor | None
     share: torch.Tensor | None
     steps: torch.Tensor | None
+
+
+def check_probability(p: Any) -> float:
+    """Returns the parameter of geometric offsets, or raises.
+
+    Args:
+        p (Any): the parameter.
+
+    Returns:
+        float: the number, in (0, 1].
+
+    Raises:
+        TypeError: it is not a number.
+        ValueError: it is out of range.
+
+    Examples:
+        >>> from torchrl_caiac.transforms.goals.offsets import check_probability
+        >>> check_probability(0.5)
+        0.5
+    """
+    number = check_number("p", p, math.inf)
+    if not 0 < number <= 1:
+        raise ValueError(f"p, of the geometric strategy, must be in (0, 1], got {p!r}")
+    return number
 
 
 def draw_goal_offset(
@@ -72,8 +97,9 @@ def draw_goal_offset(
         torch.Tensor: int64 ``[*]``, between 0 and ``remaining``.
 
     Raises:
-        TypeError: a weight is not a number.
-        ValueError: the mixture has an unknown strategy or a wrong weight.
+        TypeError: a weight or ``p`` is not a number.
+        ValueError: the mixture has an unknown strategy or a wrong weight, or ``p`` is
+            out of range.
 
     Examples:
         >>> import torch
@@ -81,6 +107,7 @@ def draw_goal_offset(
         >>> draw_goal_offset(torch.tensor([4, 0]), {"last": 1.0})
         tensor([4, 0])
     """
+    p = check_probability(p)
     numbers = draw_goal_numbers(
         remaining.shape, mixture, p=p, device=remaining.device, generator=generator
     )
@@ -178,7 +205,7 @@ def strategy_bounds(mixture: Mapping[str, float]) -> list[tuple[str, float]]:
         list of tuple: strategies and bounds, ascending from 0.
 
     Raises:
-        TypeError: a weight is not a number.
+        TypeError: the mixture is not a mapping, or a weight is not a number.
         ValueError: the mixture has an unknown strategy or a wrong weight.
 
     Examples:
@@ -186,6 +213,11 @@ def strategy_bounds(mixture: Mapping[str, float]) -> list[tuple[str, float]]:
         >>> strategy_bounds({"last": 1.0, "uniform": 0.0, "geometric": 3.0})
         [('last', 0.0), ('geometric', 0.25)]
     """
+    if not isinstance(mixture, Mapping):
+        raise TypeError(
+            f"mixture must map strategies among {list(STRATEGIES)} to weights, got "
+            f"{mixture!r}"
+        )
     mixture = dict(mixture)  # which another thread may change
     if not mixture or not set(mixture) <= set(STRATEGIES):
         raise ValueError(
