@@ -19,7 +19,13 @@ from omegaconf import DictConfig, OmegaConf
 from environments.base import Evaluation
 from environments.playing import Split
 from shared.console import progress_bar, start
-from shared.parts import candidates, make_environment, policy_file, run_folder
+from shared.parts import (
+    candidates,
+    check_learner,
+    make_environment,
+    policy_file,
+    run_folder,
+)
 from shared.settings import keep_settings
 from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.data.digests import file_digest
@@ -93,6 +99,8 @@ def play(
 @hydra.main(version_base=None, config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> None:
     """Evaluates ``cfg.method`` with ``cfg.seed``."""
+    for method in cfg.method:
+        check_learner(cfg, method)
     for method in cfg.method:
         folder = run_folder(cfg, method, cfg.seed)
         with start(cfg, folder=folder) as console:

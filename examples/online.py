@@ -20,12 +20,14 @@ import logging
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import hydra
 import numpy as np
 import torch
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import MultiSyncCollector
@@ -34,9 +36,17 @@ from torchrl.envs import DoubleToFloat, EnvBase, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
 
 from environments.fetch_push import FetchPush
+from learners.hindsight import HindsightLearner
+from learners.settings import (
+    BaseSettings,
+    Count,
+    NotNegative,
+    Share,
+    check_settings_of,
+)
 from score import make_scoring
 from shared.console import Console
-from shared.parts import make_environment, make_learner, run_folder
+from shared.parts import check_learner, make_environment, run_folder
 from shared.settings import keep_settings
 from study import prepare
 from torchrl_caiac._figures import colour, finish_results, new_figure
@@ -55,6 +65,37 @@ _LOGGER = logging.getLogger(__name__)
 COLUMNS = ("method", "seed", "episodes", "round", "split", "starts", "value")
 
 
+class OnlineSettings(BaseSettings):
+    """What the settings ``online`` may be."""
+
+    rounds: Count
+    episodes: Annotated[int, Field(ge=0)]
+    steps: Count
+    workers: Count
+    noise: NotNegative
+    offline_fraction: Share
+
+
+def check(cfg: DictConfig, method: str) -> None:
+    """Raises if a setting is wrong, before anything is collected or trained."""
+    settings = cfg.online
+    check_settings_of("online", settings, OnlineSettings)
+    if not issubclass(get_class(cfg.env._target_), FetchPush):
+        raise ValueError("online.py collects in Fetch-Push only: set env=fetch_push")
+    if not issubclass(get_class(cfg.learner._target_), HindsightLearner):
+        raise ValueError(
+            f"learner={cfg.learner.name} learns from demonstrations only: choose td3, "
+            "td3_bc or iql"
+        )
+    workers = min(settings.workers, settings.episodes)
+    if workers and settings.episodes % workers:
+        raise ValueError(
+            f"online.episodes is {settings.episodes}, expected a multiple of "
+            f"online.workers, {workers}: each worker plays whole episodes"
+        )
+    check_learner(cfg, method, settings.rounds * settings.steps)
+
+
 def make_env(steps: int) -> EnvBase:
     """Returns the environment of one worker, whose episodes have ``steps`` steps."""
     env = make_fetch_push_env(2, max_episode_steps=steps)
@@ -65,11 +106,6 @@ def collect_episodes(policy: Any, cfg: DictConfig, seed: int) -> TensorDict:
     """Returns whole episodes that workers play with noise, ``[T]``."""
     settings, steps = cfg.online, cfg.env.collect.steps
     workers = min(settings.workers, settings.episodes)
-    if settings.episodes % workers:
-        raise ValueError(
-            f"online.episodes is {settings.episodes}, expected a multiple of "
-            f"online.workers, {workers}: each worker plays whole episodes"
-        )
     frames = settings.episodes * steps
     noise = AdditiveGaussianModule(
         Bounded(-1.0, 1.0, (4,)),
@@ -142,13 +178,10 @@ def success(
 def run(cfg: DictConfig, method: str, seed: int) -> Iterator[dict[str, Any]]:
     """Trains offline and then online; yields the success before and after."""
     settings = cfg.online
-    whole = cfg.learner.steps + settings.rounds * settings.steps
-    make_learner(cfg, method).check(whole)
+    check(cfg, method)
     folder = run_folder(cfg, method, seed) / f"online-{settings.episodes}"
     folder.mkdir(parents=True, exist_ok=True)
     learner: Any = train(cfg, method, seed)
-    if not isinstance(learner.environment, FetchPush):
-        raise ValueError("online.py collects in Fetch-Push only: set env=fetch_push")
     kept = OmegaConf.to_container(settings, resolve=True)
     kept = {key: value for key, value in kept.items() if key != "rounds"}
     kept |= {"offline": cfg.learner.steps, **learner.kept_settings(seed)}
@@ -249,6 +282,8 @@ def main(cfg: DictConfig) -> None:
     torch.set_num_threads(1)
     path = Path(cfg.publish) / "online.csv"
     runs = [(method, seed) for seed in cfg.seeds for method in cfg.method]
+    for method in cfg.method:
+        check(cfg, method)
     with Console(Path(cfg.out) / "online", stages=3 + len(runs)) as console:
         prepare(cfg, console)
         for method, seed in runs:

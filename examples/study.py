@@ -43,7 +43,7 @@ from figures import answer_study, draw_study, report_study
 from fit import fit
 from score import score
 from shared.console import Console, log_in_process
-from shared.parts import make_environment, run_folder
+from shared.parts import check_learner, make_environment, run_folder
 from shared.results import add_rows, read_rows, remove_runs, state_of, unlisted
 from shared.studies import Run, Study, ad_hoc_study, digest, load_study, run_settings
 from torchrl_caiac._files import claim_folder, write_json
@@ -312,6 +312,8 @@ def run_study(options: Options, console: Console) -> None:
     study = options.study
     runs = study.runs()
     missing = missing_runs(options, runs)
+    for job in missing:
+        check_learner(job.cfg, job.method)
     needed = preparations(missing)
     console.stages = {0: 1, 1: 5}.get(len(needed), 3)
     if len(needed) == 1:

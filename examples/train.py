@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 from learners.base import Learner
 from shared.console import progress_bar, start
 from shared.log import ScalarLog
-from shared.parts import make_learner, policy_file, run_folder
+from shared.parts import check_learner, make_learner, policy_file, run_folder
 from shared.settings import check_settings, keep_settings
 from torchrl_caiac._files import read_json, whole_file, write_json
 from torchrl_caiac.checkpoint import TrainingCheckpoint
@@ -33,8 +33,8 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
     folder = run_folder(cfg, method, seed)
     learner = make_learner(cfg, method)
     kept = learner.kept_settings(seed)
-    keep_settings(folder, "train", kept)
     learner.setup(learner.rows(), seed)
+    keep_settings(folder, "train", kept)  # of a run that can begin
     log = ScalarLog(settings.logger, folder)
     checkpoint = TrainingCheckpoint(
         folder / "checkpoint.zip", settings=kept, log=log, **learner.parts
@@ -108,6 +108,8 @@ def load_policy(cfg: DictConfig, method: str, seed: int, step: int) -> Any:
 @hydra.main(version_base=None, config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> None:
     """Trains with ``cfg.method`` and ``cfg.seed``."""
+    for method in cfg.method:
+        check_learner(cfg, method)
     for method in cfg.method:
         folder = run_folder(cfg, method, cfg.seed)
         with start(cfg, folder=folder) as console, console.stage(folder.name):

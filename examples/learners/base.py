@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -14,6 +14,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import Transform
 
 from environments.base import Environment
+from learners.settings import BaseSettings, Count, check_settings_of
 from methods.base import Method
 from torchrl_caiac.data.digests import content_digests
 
@@ -24,9 +25,8 @@ class Learner(ABC):
     """Learns a policy from the rows of an environment, augmented by a method.
 
     A subclass in a module of this folder, with a file ``conf/learner/<name>.yaml`` that
-    has its settings, is all that a new learner needs. The settings ``steps``,
-    ``log_every``, ``checkpoint_every``, ``keep_every`` and ``logger`` are read by
-    ``train.py``.
+    has its settings, is all that a new learner needs. ``train.py`` reads those of
+    :class:`Settings`; a subclass adds the types and ranges of its own.
 
     Args:
         settings (DictConfig): ``cfg.learner``.
@@ -34,6 +34,16 @@ class Learner(ABC):
         method (Method): the augmentation.
         augmentation (DictConfig): ``cfg.env.augmentation``.
     """
+
+    class Settings(BaseSettings):
+        """What the settings may be."""
+
+        steps: Count
+        log_every: Count
+        checkpoint_every: Count
+        keep_every: Count | None
+        logger: Literal["csv", "tensorboard", "wandb"]
+        batches_at_once: Count | None = None
 
     extendable: ClassVar[bool] = False
     """Whether ``steps`` may be raised later, for finished runs to be extended."""
@@ -119,22 +129,23 @@ class Learner(ABC):
         number = self.settings.get("batches_at_once")
         return 1 if number is None else int(number)
 
-    def check(self, steps: int | None = None) -> None:
+    def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong, before anything is read or written.
 
-        Here: if a run could stop in the middle of a sample.
-
         Args:
-            steps (int, optional): of the whole run. Defaults to ``settings.steps``.
+            further (int): steps that follow in ``online.py``. Defaults to 0.
         """
-        if self.at_once < 1:
+        settings = self.settings
+        check_settings_of("learner", settings, self.Settings)
+        if (settings.keep_every or 1) > settings.steps:
             raise ValueError(
-                f"learner.batches_at_once is {self.at_once}, expected at least 1"
+                f"learner.keep_every is {settings.keep_every}, expected at most "
+                f"learner.steps, {settings.steps}: no policy would be kept"
             )
         for name in ("steps", "checkpoint_every"):
-            if self.settings[name] % self.at_once:
+            if settings[name] % self.at_once:
                 raise ValueError(
-                    f"learner.{name} is {self.settings[name]}, expected a multiple of "
+                    f"learner.{name} is {settings[name]}, expected a multiple of "
                     f"learner.batches_at_once, {self.at_once}: a run could not resume "
                     "in the middle of a sample"
                 )

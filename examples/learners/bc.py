@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss, LossModule
 
 from learners.goal_conditioned import GoalConditioned, descend
-from learners.imitation import future_goals, has_own_goals, imitation_buffer
+from learners.imitation import future_goals, imitation_buffer
+from learners.settings import NotNegative, Positive
+from torchrl_caiac.transforms import WindowGoal
 
 __all__ = ["BC"]
 
@@ -21,14 +25,21 @@ class _BCLoss(BCLoss):
 class BC(GoalConditioned):
     """Repeats the actions of demonstrations, of counterfactual ones too."""
 
+    class Settings(GoalConditioned.Settings):
+        """What the settings may be."""
+
+        goals: Literal["own", "future"]
+        future_goals: Any
+        lr: Positive
+        weight_decay: NotNegative
+
     window = 1
     """Rows that follow each other, from which a row to learn from is made."""
 
-    def check(self, steps: int | None = None) -> None:
+    def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong; see the base class."""
-        super().check(steps)
-        if not has_own_goals(self.settings):
-            future_goals(self, self.window)  # or raises
+        super().check(further)
+        self.make_goals()  # or raises
 
     def stored_rows(self) -> TensorDictBase:
         """Returns the demonstrations."""
@@ -36,18 +47,22 @@ class BC(GoalConditioned):
 
     def rows(self) -> TensorDictBase:
         """Returns what learning reads of the demonstrations, in memory."""
-        own = has_own_goals(self.settings)
-        return self.read_leaves(self.stored_rows(), goals=own)
+        return self.read_leaves(self.stored_rows(), goals=self.make_goals() is None)
+
+    def make_goals(self) -> WindowGoal | None:
+        """Returns what draws later states as goals; ``None``: rows keep their own."""
+        if self.settings.goals == "own":
+            return None
+        return future_goals(self, self.window)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of transitions, their goals, and counterfactuals."""
-        own = has_own_goals(self.settings)
         return imitation_buffer(
             self,
             rows,
             batch_size=self.rows_at_once * self.window,
             window=self.window,
-            goals=None if own else future_goals(self, self.window),
+            goals=self.make_goals(),
         )
 
     def setup(self, rows: TensorDictBase, seed: int) -> None:

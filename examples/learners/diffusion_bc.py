@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
@@ -16,6 +18,7 @@ from torchrl.objectives import DiffusionBCLoss
 
 from learners.bc import BC
 from learners.chunks import ChunkActor
+from learners.settings import BelowOne, Count
 from torchrl_caiac.modules import GoalFeatures
 
 __all__ = ["DiffusionBC"]
@@ -65,7 +68,28 @@ class DiffusionBC(BC):
     of a window are swapped together, so the method's rule holds for the whole chunk.
     """
 
+    class Settings(BC.Settings):
+        """What the settings may be."""
+
+        chunk: Count
+        execute: Count
+        sample: bool
+        diffusion_steps: Count
+        beta_start: BelowOne
+        beta_end: BelowOne
+        hidden_sizes: Annotated[list[Count], Field(min_length=2)]
+
     actor: ChunkActor
+
+    def check(self, further: int = 0) -> None:
+        """Raises if a setting is wrong; see the base class."""
+        super().check(further)
+        settings = self.settings
+        if settings.execute > settings.chunk:
+            raise ValueError(
+                f"learner.execute is {settings.execute}, expected at most "
+                f"learner.chunk, {settings.chunk}, the actions that are made at once"
+            )
 
     @property
     def window(self) -> int:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from omegaconf import ListConfig
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 
 from learners.base import Learner
+from learners.settings import Count, Sizes
 from torchrl_caiac.modules import GoalConditionedActor, GoalFeatures
 
 __all__ = ["GoalConditioned", "descend"]
@@ -23,28 +23,19 @@ _STATISTICS_BATCHES = 100  # from which the features' mean and deviation are tak
 class GoalConditioned(Learner):
     """A policy ``π(s, g)`` that reads :class:`~torchrl_caiac.modules.GoalFeatures`.
 
-    It needs the settings ``steps``, ``checkpoint_every``, ``batch_size``,
-    ``batches_at_once``, ``hidden_sizes`` and ``hidden_dtype``; ``policy_sizes`` are the
-    hidden layers of the policy, if they differ.
+    ``policy_sizes`` are the hidden layers of the policy, if they differ.
     """
+
+    class Settings(Learner.Settings):
+        """What the settings may be."""
+
+        batch_size: Count
+        hidden_sizes: Sizes
+        policy_sizes: Sizes | None = None
+        hidden_dtype: Literal["auto", "float32", "bfloat16"] = "float32"
 
     rb: ReplayBuffer
     actor: GoalConditionedActor
-
-    def check(self, steps: int | None = None) -> None:
-        """Raises if a setting is wrong; see the base class."""
-        super().check(steps)
-        for name in ("hidden_sizes", "policy_sizes"):
-            sizes = self.settings.get(name)
-            if sizes is None and name == "policy_sizes":
-                continue
-            if not isinstance(sizes, ListConfig) or not all(
-                type(size) is int and size > 0 for size in [*sizes] or [None]
-            ):
-                raise ValueError(
-                    f"learner.{name} is {sizes!r}, expected a list of the widths of "
-                    "hidden layers, integers from 1 on"
-                )
 
     def start(self, rows: TensorDictBase, seed: int) -> GoalFeatures:
         """Makes the buffer; returns features with the statistics of some batches.
@@ -83,12 +74,7 @@ class GoalConditioned(Learner):
     @property
     def hidden_dtype(self) -> torch.dtype | None:
         """The dtype of the products of the hidden layers."""
-        name = self.settings.hidden_dtype
-        if name not in ("float32", "bfloat16"):
-            raise ValueError(
-                f"learner.hidden_dtype is {name!r}, expected auto, float32 or bfloat16"
-            )
-        return None if name == "float32" else torch.bfloat16
+        return torch.bfloat16 if self.settings.hidden_dtype == "bfloat16" else None
 
     @property
     def rows_at_once(self) -> int:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, Storage
 
 from learners.goal_conditioned import GoalConditioned
+from learners.settings import Positive, Share
 from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.trajectories import trajectory_index
 from torchrl_caiac.transforms import HindsightGoal, TransformKeys
@@ -78,15 +80,25 @@ class ShareSampler(RandomSampler):
 class HindsightLearner(GoalConditioned):
     """Learns values of rewards for goals, from all rows of the environment."""
 
+    class Settings(GoalConditioned.Settings):
+        """What the settings may be."""
+
+        successful: Share | None = None
+        random_goals: bool = True
+        layer_norm: bool = False
+        gamma: Annotated[float, Field(ge=0, lt=1)]
+        tau: Annotated[float, Field(gt=0, le=1)]
+        lr: Positive
+
     extendable = True
     reads = (
         *GoalConditioned.reads,
         *[("next", name) for name in ("reward", "terminated")],
     )
 
-    def check(self, steps: int | None = None) -> None:
+    def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong; see the base class."""
-        super().check(steps)
+        super().check(further)
         if self.environment.reward_fn is None:
             raise ValueError(
                 f"learner={self.settings.name} needs rewards for goals, which "

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import SliceSampler, TensorDictReplayBuffer
 
@@ -13,21 +12,7 @@ from learners.base import Learner
 from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.transforms import WindowGoal
 
-__all__ = ["future_goals", "has_own_goals", "imitation_buffer"]
-
-
-def has_own_goals(settings: DictConfig) -> bool:
-    """Returns whether rows keep their desired goals, ``goals: own``.
-
-    Raises:
-        ValueError: ``goals`` is neither ``own`` nor ``future``.
-    """
-    if settings.goals not in ("own", "future"):
-        raise ValueError(
-            f"learner.goals is {settings.goals!r}, expected 'own' (the desired goal of "
-            "the episode) or 'future' (later states of it, see learner.future_goals)"
-        )
-    return bool(settings.goals == "own")
+__all__ = ["future_goals", "imitation_buffer", "window_goals"]
 
 
 def future_goals(learner: Learner, window: int = 1) -> WindowGoal:
@@ -47,13 +32,31 @@ def future_goals(learner: Learner, window: int = 1) -> WindowGoal:
             f"learner.future_goals is {given}, expected {wanted}: without geometric "
             "offsets p has no effect"
         )
+    return window_goals(learner, "future_goals", mixture, window, **offset)
+
+
+def window_goals(
+    learner: Learner, name: str, mixture: Mapping[str, Any], window: int, **offset: Any
+) -> WindowGoal:
+    """Returns what draws later states as goals.
+
+    Args:
+        learner (Learner): has the layout.
+        name (str): the setting with the weights, for the error.
+        mixture (mapping): the weights of strategies.
+        window (int): rows in a window.
+        **offset (Any): ``p`` of geometric offsets.
+
+    Raises:
+        ValueError: these are no weights of strategies.
+    """
     try:
         return WindowGoal(
             learner.environment.layout, window=window, mixture=mixture, **offset
         )
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"learner.future_goals is {given}, expected {wanted}: {error}"
+            f"learner.{name} is {learner.settings[name]}: {error}"
         ) from error
 
 

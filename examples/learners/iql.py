@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 import torch
@@ -20,16 +19,12 @@ from torchrl.objectives import IQLLoss, SoftUpdate
 from learners.goal_conditioned import descend
 from learners.hindsight import HindsightLearner
 from learners.imitation import future_goals, imitation_buffer
+from learners.settings import BelowOne, Count, NotNegative, Positive
 from torchrl_caiac.modules import GoalConditionedCritic, GoalConditionedValue
 from torchrl_caiac.transforms import TransformKeys
 from torchrl_caiac.transforms.rewards import GoalLeaves, goal_vectors
 
 __all__ = ["IQL"]
-
-
-def _number(value: Any) -> float:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if is_number else math.nan
 
 
 class IQL(HindsightLearner):
@@ -40,27 +35,25 @@ class IQL(HindsightLearner):
     unlikely.
     """
 
-    def check(self, steps: int | None = None) -> None:
+    class Settings(HindsightLearner.Settings):
+        """What the settings may be."""
+
+        future_goals: Any
+        expectile: BelowOne
+        temperature: NotNegative
+        deviation: Positive
+        decay_steps: Count | None
+
+    def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong; see the base class."""
-        super().check(steps)
+        super().check(further)
         settings = self.settings
-        if not 0 <= _number(settings.temperature) < math.inf:
-            raise ValueError(
-                f"learner.temperature is {settings.temperature!r}, expected a number "
-                "from 0 on"
-            )
-        if not 0 < _number(settings.expectile) < 1:
-            raise ValueError(
-                f"learner.expectile is {settings.expectile!r}, expected a number "
-                "between 0 and 1"
-            )
-        steps = settings.steps if steps is None else steps
+        steps = settings.steps + further
         decay = settings.decay_steps
-        if decay is not None and (type(decay) is not int or decay < max(steps, 1)):
+        if decay is not None and decay < steps:
             raise ValueError(
-                f"learner.decay_steps is {decay!r}, expected null or an integer from "
-                f"{steps} on, the steps of the whole run: later the learning rate "
-                "would rise again"
+                f"learner.decay_steps is {decay}, expected null or at least {steps}, "
+                "the steps of the whole run: later the learning rate would rise again"
             )
         if settings.future_goals is not None:
             future_goals(self)  # or raises
@@ -109,6 +102,10 @@ class IQL(HindsightLearner):
                 self.optimizer, settings.decay_steps
             )
             self.parts["scheduler"] = self.scheduler
+
+    def learning_rows(self, stored: TensorDictBase) -> TensorDictBase:
+        """Returns what learning reads; goals that are drawn need no stored ones."""
+        return self.read_leaves(stored, goals=self.settings.future_goals is None)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer; with ``future_goals``, of goals that imitation learns.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
 from learners.base import Learner
-from learners.imitation import imitation_buffer
+from learners.imitation import imitation_buffer, window_goals
+from learners.settings import Count, NotNegative, Positive
 from torchrl_caiac.modules import LMPActor, LMPModel
 from torchrl_caiac.objectives import LMPLoss
 from torchrl_caiac.transforms import WindowGoal
@@ -20,6 +21,34 @@ __all__ = ["LMP"]
 
 class LMP(Learner):
     """Plans for windows of trajectories, whose goals are later states."""
+
+    class Settings(Learner.Settings):
+        """What the settings may be."""
+
+        windows: Count
+        window: Count
+        goals: dict[str, Any]
+        goal_p: Any
+        plan_dim: Count
+        hidden_size: Count
+        decoder: Literal["open_loop", "closed_loop"]
+        observation_floor: Positive
+        resting: NotNegative
+        reconstruction_weight: NotNegative
+        kl_weight: NotNegative
+        lr: Positive
+
+    def check(self, further: int = 0) -> None:
+        """Raises if a setting is wrong; see the base class."""
+        super().check(further)
+        self.make_goals()  # or raises
+
+    def make_goals(self) -> WindowGoal:
+        """Returns what draws the goals of windows."""
+        settings = self.settings
+        return window_goals(
+            self, "goals", dict(settings.goals), settings.window, p=settings.goal_p
+        )
 
     def stored_rows(self) -> TensorDictBase:
         """Returns the demonstrations."""
@@ -32,18 +61,12 @@ class LMP(Learner):
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of windows, their goals, and counterfactuals."""
         settings = self.settings
-        goals = WindowGoal(
-            self.environment.layout,
-            window=settings.window,
-            mixture=dict(settings.goals),
-            p=settings.goal_p,
-        )
         return imitation_buffer(
             self,
             rows,
             batch_size=settings.windows * self.at_once * settings.window,
             window=settings.window,
-            goals=goals,
+            goals=self.make_goals(),
         )
 
     def setup(self, rows: TensorDictBase, seed: int) -> None:

@@ -10,6 +10,7 @@ from torchrl.objectives import SoftUpdate
 
 from learners.goal_conditioned import descend
 from learners.hindsight import HindsightLearner
+from learners.settings import Count, NotNegative
 from torchrl_caiac.modules import GoalConditionedCritic
 from torchrl_caiac.objectives import GoalConditionedTD3Loss
 
@@ -18,6 +19,13 @@ __all__ = ["TD3"]
 
 class TD3(HindsightLearner):
     """TD3 on stored transitions; needs an environment with rewards of goals."""
+
+    class Settings(HindsightLearner.Settings):
+        """What the settings may be."""
+
+        policy_delay: Count
+        policy_noise: NotNegative
+        noise_clip: NotNegative
 
     def setup(self, rows: TensorDictBase, seed: int) -> None:
         """Makes policy and critics, with the statistics of some batches."""

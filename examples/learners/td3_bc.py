@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from learners.hindsight import UNEXPLAINED, until_success
+from learners.settings import NotNegative
 from learners.td3 import TD3
 
 __all__ = ["TD3BC"]
@@ -21,6 +22,11 @@ class TD3BC(TD3):
     Where no episode has a goal of its own it repeats all actions. It repeats those of
     counterfactuals too: a swap leaves out what the action is for.
     """
+
+    class Settings(TD3.Settings):
+        """What the settings may be."""
+
+        bc_alpha: NotNegative
 
     def learning_rows(self, stored: TensorDictBase) -> TensorDictBase:
         """Returns what learning reads, and which actions are not repeated."""

@@ -21,6 +21,7 @@ from torchrl_caiac.modules import faster_dtype
 
 __all__ = [
     "candidates",
+    "check_learner",
     "hidden_dtype",
     "kept_steps",
     "make_environment",
@@ -63,15 +64,31 @@ def make_methods(cfg: DictConfig) -> dict[str, Method]:
 def make_learner(cfg: DictConfig, method: str) -> Learner:
     """Returns the learner ``cfg.learner`` for one of the methods."""
     cfg = cfg.copy()
+    check_learner(cfg, method)
+    learner = _unchecked(cfg, method)
+    if cfg.learner.get("hidden_dtype") == "auto":
+        learner.settings.hidden_dtype = hidden_dtype(cfg)
+    return learner
+
+
+def check_learner(cfg: DictConfig, method: str, further: int = 0) -> None:
+    """Raises if a setting of the learner is wrong; reads and writes no file.
+
+    Args:
+        cfg (DictConfig): the configuration.
+        method (str): one of the methods.
+        further (int): steps that follow in ``online.py``. Defaults to 0.
+    """
+    _unchecked(cfg, method).check(further)
+
+
+def _unchecked(cfg: DictConfig, method: str) -> Learner:
     learner: Learner = get_class(cfg.learner._target_)(
         cfg.learner,
         make_environment(cfg),
         make_method(cfg, method),
         cfg.env.augmentation,
     )
-    learner.check()
-    if cfg.learner.get("hidden_dtype") == "auto":
-        learner.settings.hidden_dtype = hidden_dtype(cfg)
     return learner
 
 
@@ -104,13 +121,7 @@ def kept_steps(cfg: DictConfig) -> list[int]:
     """Returns the training steps after which policies are kept."""
     last = cfg.learner.steps
     every = cfg.learner.keep_every or last
-    kept = list(range(every, last + 1, every))
-    if not kept:
-        raise ValueError(
-            f"learner.steps is {last}, expected at least learner.keep_every, {every}: "
-            "no policy is kept"
-        )
-    return kept
+    return list(range(every, last + 1, every))
 
 
 def candidates(cfg: DictConfig) -> list[int]:

@@ -54,7 +54,7 @@ def test_the_learning_rate_must_not_rise_again_online(compose, steps, tmp_path):
     cfg = compose("learner=iql", config="online", out=tmp_path)
     cfg.learner.update({"steps": 8, "decay_steps": 8})
     cfg.online.update({"rounds": 2, "steps": 3})
-    with pytest.raises(ValueError, match=r"decay_steps is 8, expected .* from 14 on"):
+    with pytest.raises(ValueError, match=r"decay_steps is 8, expected .* at least 14"):
         next(steps.online.run(cfg, "none", 0))
 
 
@@ -72,7 +72,24 @@ def test_results_of_a_run_replace_those_before(steps, tmp_path):
     assert values == [("2", "1"), ("1", "0.5")]
 
 
-def test_episodes_are_shared_evenly(cfg, steps):
-    uneven = OmegaConf.merge(cfg, {"online": {"episodes": 3, "workers": 2}})
-    with pytest.raises(ValueError, match="multiple"):
-        steps.online.collect_episodes(None, uneven, 0)
+@pytest.mark.parametrize(
+    ("learner", "options", "match"),
+    [
+        ("td3_bc", ["online.episodes=3"], "online.episodes is 3, expected a multiple"),
+        ("td3_bc", ["online.rounds=null"], "online.rounds is None"),
+        ("td3_bc", ["online.steps=1.5"], "online.steps is 1.5"),
+        ("td3_bc", ["online.offline_fraction=2"], "online.offline_fraction is 2"),
+        ("td3_bc", ["learner.lr=-1"], "learner.lr is -1"),
+        ("td3_bc", ["env=kitchen"], "collects in Fetch-Push only"),
+        ("bc", [], "learner=bc learns from demonstrations only"),
+        ("lmp", [], "learner=lmp learns from demonstrations only"),
+    ],
+)
+def test_wrong_settings_are_refused_first(
+    learner, options, match, compose, steps, tmp_path
+):
+    cfg = compose(f"learner={learner}", *options, config="online")
+    cfg.out = str(tmp_path)
+    with pytest.raises(ValueError, match=match):
+        next(steps.online.run(cfg, "none", 0))
+    assert not [*tmp_path.iterdir()]
