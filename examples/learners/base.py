@@ -149,6 +149,7 @@ class Learner(ABC):
                     f"learner.batches_at_once, {self.at_once}: a run could not resume "
                     "in the middle of a sample"
                 )
+        self.counterfactuals()  # or raises
 
     def split(self, sample: TensorDictBase) -> Iterator[TensorDictBase]:
         """Yields the batches of one sample."""

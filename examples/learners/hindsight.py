@@ -105,6 +105,27 @@ class HindsightLearner(GoalConditioned):
                 f"{type(self.environment).__name__} does not have: set its reward_fn, "
                 "or choose another learner"
             )
+        self.make_goals()  # or raises
+
+    def make_goals(self) -> HindsightGoal:
+        """Returns what draws goals in hindsight.
+
+        Half of the counterfactuals have goals that others achieve. Without augmentation
+        there are as many random goals as counterfactuals would have (A.5.2). With the
+        setting ``random_goals: false`` there are none: no action explains them, which
+        matters to a learner that repeats actions.
+        """
+        environment, augmentation = self.environment, self.augmentation
+        random = 0.5 if self.settings.get("random_goals", True) else 0.0
+        share = augmentation.counterfactual_ratio
+        return HindsightGoal(
+            environment.layout,
+            environment.reward_fn,
+            random=random * share if self.counterfactuals() is None else 0.0,
+            counterfactual=random,
+            keys=TransformKeys(unexplained=UNEXPLAINED),
+            **augmentation.get("hindsight", {}),
+        )
 
     def rows(self) -> TensorDictBase:
         """Returns what learning reads, in memory."""
@@ -122,30 +143,14 @@ class HindsightLearner(GoalConditioned):
         return self._make_buffer(rows, share)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
-        """Makes the buffer of transitions, counterfactuals, and hindsight goals.
-
-        Half of the counterfactuals have goals that others achieve. Without augmentation
-        there are as many random goals as counterfactuals would have (A.5.2). With the
-        setting ``random_goals: false`` there are none: no action explains them, which
-        matters to a learner that repeats actions.
-        """
+        """Makes the buffer of transitions, counterfactuals, and hindsight goals."""
         return self._make_buffer(rows, self.settings.get("successful"))
 
     def _make_buffer(
         self, rows: TensorDictBase, share: float | None
     ) -> TensorDictReplayBuffer:
         environment = self.environment
-        augmentation = self.counterfactuals()
-        ratio = self.augmentation.counterfactual_ratio
-        random = 0.5 if self.settings.get("random_goals", True) else 0.0
-        goals = HindsightGoal(
-            environment.layout,
-            environment.reward_fn,
-            random=random * ratio if augmentation is None else 0.0,
-            counterfactual=random,
-            keys=TransformKeys(unexplained=UNEXPLAINED),
-            **self.augmentation.get("hindsight", {}),
-        )
+        augmentation, goals = self.counterfactuals(), self.make_goals()
         options: dict[str, Any] = {}
         if share is not None:
             if not environment.episodes_have_goals:

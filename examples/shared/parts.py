@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 
 from environments.base import Environment
 from learners.base import Learner
+from learners.settings import BaseSettings, Count, check_settings_of
 from methods.base import Method
 from torchrl_caiac._files import read_json, write_json
 from torchrl_caiac.modules import faster_dtype
@@ -34,6 +35,12 @@ __all__ = [
 
 
 _LOGGER = logging.getLogger(__name__)
+
+
+class ValidationSettings(BaseSettings):
+    """What the settings ``validation`` may be."""
+
+    policies: Count | None
 
 
 def make_environment(cfg: DictConfig) -> Environment:
@@ -72,13 +79,14 @@ def make_learner(cfg: DictConfig, method: str) -> Learner:
 
 
 def check_learner(cfg: DictConfig, method: str, further: int = 0) -> None:
-    """Raises if a setting of the learner is wrong; reads and writes no file.
+    """Raises if a setting of a run is wrong; reads and writes no file.
 
     Args:
         cfg (DictConfig): the configuration.
         method (str): one of the methods.
         further (int): steps that follow in ``online.py``. Defaults to 0.
     """
+    check_settings_of("validation", cfg.validation, ValidationSettings)
     _unchecked(cfg, method).check(further)
 
 

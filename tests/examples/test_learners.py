@@ -467,6 +467,29 @@ def test_wrong_settings_are_refused_before_anything_is_written(
     assert not steps.parts.run_folder(cfg, "motion", 0).exists()
 
 
+@pytest.mark.parametrize(
+    ("option", "match"),
+    [
+        ("env.augmentation.counterfactual_ratio=2", "counterfactual_ratio must be"),
+        ("env.augmentation.swap_prob=often", "swap_prob must be a number"),
+        ("env.augmentation.lookahead=-1", "lookahead"),
+        ("validation.policies=0", "validation.policies is 0"),
+    ],
+)
+def test_settings_of_augmentation_and_validation(option, match, configure, steps):
+    cfg = configure("fetch_push", "td3", option)
+    with pytest.raises((TypeError, ValueError), match=match):
+        steps.train.train(cfg, "motion", 0)
+    assert not steps.parts.run_folder(cfg, "motion", 0).exists()
+
+
+def test_goals_of_hindsight_are_checked_first(configure, steps):
+    cfg = configure("fetch_push", "td3")
+    OmegaConf.update(cfg, "env.augmentation.hindsight", {"future": 2}, force_add=True)
+    with pytest.raises(ValueError, match="future must be in"):
+        steps.parts.check_learner(cfg, "motion")
+
+
 def test_a_run_that_cannot_begin_keeps_no_settings(configure, steps, monkeypatch):
     """Scores that are missing are scored; the run is then the first one."""
     cfg = configure("fetch_push", "bc")
