@@ -35,13 +35,12 @@ from torchrl.data import Bounded
 from torchrl.envs import DoubleToFloat, EnvBase, TransformedEnv
 from torchrl.modules import AdditiveGaussianModule
 
-from environments.fetch_push import FetchPush
 from learners.hindsight import HindsightLearner
 from learners.settings import (
     BaseSettings,
+    BelowOne,
     Count,
     NotNegative,
-    Share,
     check_settings_of,
 )
 from score import make_scoring
@@ -73,14 +72,22 @@ class OnlineSettings(BaseSettings):
     steps: Count
     workers: Count
     noise: NotNegative
-    offline_fraction: Share
+    offline_fraction: BelowOne
+
+
+class OnlineSeeds(BaseSettings):
+    """What the setting ``seeds`` may be."""
+
+    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 
 
 def check(cfg: DictConfig, method: str) -> None:
     """Raises if a setting is wrong, before anything is collected or trained."""
     settings = cfg.online
     check_settings_of("online", settings, OnlineSettings)
-    if not issubclass(get_class(cfg.env._target_), FetchPush):
+    seeds = OmegaConf.masked_copy(cfg, ["seeds"])
+    check_settings_of("online.py", seeds, OnlineSeeds)
+    if cfg.env.name != "fetch_push":
         raise ValueError("online.py collects in Fetch-Push only: set env=fetch_push")
     if not issubclass(get_class(cfg.learner._target_), HindsightLearner):
         raise ValueError(

@@ -311,9 +311,12 @@ def run_study(options: Options, console: Console) -> None:
     """Does what is missing, writes the results and figures, and prints them."""
     study = options.study
     runs = study.runs()
-    missing = missing_runs(options, runs)
-    for job in missing:
-        check_learner(job.cfg, job.method)
+    for job in filter(options.wanted, runs):
+        try:
+            check_learner(job.cfg, job.method)
+        except ValueError as error:
+            raise ValueError(f"{job}: {error}") from error
+    missing = missing_runs(options, runs)  # removes outdated results if asked
     needed = preparations(missing)
     console.stages = {0: 1, 1: 5}.get(len(needed), 3)
     if len(needed) == 1:

@@ -33,6 +33,8 @@ def train(cfg: DictConfig, method: str, seed: int) -> Learner:
     folder = run_folder(cfg, method, seed)
     learner = make_learner(cfg, method)
     kept = learner.kept_settings(seed)
+    if (folder / "train.json").exists():
+        check_settings(folder, "train", kept)
     learner.setup(learner.rows(), seed)
     keep_settings(folder, "train", kept)  # of a run that can begin
     log = ScalarLog(settings.logger, folder)

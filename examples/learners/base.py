@@ -14,7 +14,12 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import Transform
 
 from environments.base import Environment
-from learners.settings import BaseSettings, Count, check_settings_of
+from learners.settings import (
+    AugmentationSettings,
+    BaseSettings,
+    Count,
+    check_settings_of,
+)
 from methods.base import Method
 from torchrl_caiac.data.digests import content_digests
 
@@ -137,7 +142,9 @@ class Learner(ABC):
         """
         settings = self.settings
         check_settings_of("learner", settings, self.Settings)
-        if (settings.keep_every or 1) > settings.steps:
+        check_settings_of("env.augmentation", self.augmentation, AugmentationSettings)
+        # Policies of a run that goes on in online.py need not be kept.
+        if not further and (settings.keep_every or 1) > settings.steps:
             raise ValueError(
                 f"learner.keep_every is {settings.keep_every}, expected at most "
                 f"learner.steps, {settings.steps}: no policy would be kept"
@@ -149,7 +156,29 @@ class Learner(ABC):
                     f"learner.batches_at_once, {self.at_once}: a run could not resume "
                     "in the middle of a sample"
                 )
-        self.counterfactuals()  # or raises
+        self._check_counterfactuals()
+
+    def _check_counterfactuals(self) -> None:
+        try:
+            augmentation = self.counterfactuals()
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"env.augmentation, or the method: {error}") from error
+        if (
+            augmentation is not None
+            and self.augmentation.get("lookahead") == "goal"
+            and not self.swaps_after_goals
+        ):
+            raise ValueError(
+                "env.augmentation.lookahead is 'goal', but "
+                f"learner={self.settings.name} draws no goals before the swap: set it "
+                "to next, or learner.goals=future or learner.future_goals if the "
+                "learner has it"
+            )
+
+    @property
+    def swaps_after_goals(self) -> bool:
+        """Whether goals are drawn before the swap, for ``lookahead: goal``."""
+        return False
 
     def split(self, sample: TensorDictBase) -> Iterator[TensorDictBase]:
         """Yields the batches of one sample."""
@@ -165,15 +194,10 @@ class Learner(ABC):
         Returns:
             Transform, optional: to append to the buffer; ``None`` without augmentation.
         """
-        settings = self.augmentation
-        if settings.get("lookahead") is not None:
-            options["lookahead"] = settings.lookahead
-        return self.method.transform(
-            self.environment.layout,
-            settings.counterfactual_ratio,
-            swap_prob=settings.swap_prob,
-            **options,
-        )
+        for name in ("counterfactual_ratio", "swap_prob", "lookahead"):
+            if self.augmentation.get(name) is not None:
+                options[name] = self.augmentation[name]
+        return self.method.transform(self.environment.layout, **options)
 
     @abstractmethod
     def make_buffer(self, rows: TensorDictBase) -> ReplayBuffer:

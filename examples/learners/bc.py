@@ -12,7 +12,6 @@ from torchrl.objectives import BCLoss, LossModule
 from learners.goal_conditioned import GoalConditioned, descend
 from learners.imitation import future_goals, imitation_buffer
 from learners.settings import NotNegative, Positive
-from torchrl_caiac.transforms import WindowGoal
 
 __all__ = ["BC"]
 
@@ -39,7 +38,18 @@ class BC(GoalConditioned):
     def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong; see the base class."""
         super().check(further)
-        self.make_goals()  # or raises
+        future_goals(self, self.window)  # or raises
+        if not self.swaps_after_goals and not self.environment.episodes_have_goals:
+            raise ValueError(
+                "learner.goals is 'own', but no episode of "
+                f"{type(self.environment).__name__} has a goal of its own: set it to "
+                "future"
+            )
+
+    @property
+    def swaps_after_goals(self) -> bool:
+        """Whether goals are drawn before the swap, for ``lookahead: goal``."""
+        return bool(self.settings.goals == "future")
 
     def stored_rows(self) -> TensorDictBase:
         """Returns the demonstrations."""
@@ -47,13 +57,7 @@ class BC(GoalConditioned):
 
     def rows(self) -> TensorDictBase:
         """Returns what learning reads of the demonstrations, in memory."""
-        return self.read_leaves(self.stored_rows(), goals=self.make_goals() is None)
-
-    def make_goals(self) -> WindowGoal | None:
-        """Returns what draws later states as goals; ``None``: rows keep their own."""
-        if self.settings.goals == "own":
-            return None
-        return future_goals(self, self.window)
+        return self.read_leaves(self.stored_rows(), goals=not self.swaps_after_goals)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of transitions, their goals, and counterfactuals."""
@@ -62,7 +66,7 @@ class BC(GoalConditioned):
             rows,
             batch_size=self.rows_at_once * self.window,
             window=self.window,
-            goals=self.make_goals(),
+            goals=future_goals(self, self.window) if self.swaps_after_goals else None,
         )
 
     def setup(self, rows: TensorDictBase, seed: int) -> None:

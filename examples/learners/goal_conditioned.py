@@ -74,7 +74,8 @@ class GoalConditioned(Learner):
     @property
     def hidden_dtype(self) -> torch.dtype | None:
         """The dtype of the products of the hidden layers."""
-        return torch.bfloat16 if self.settings.hidden_dtype == "bfloat16" else None
+        is_bfloat16 = self.settings.get("hidden_dtype") == "bfloat16"
+        return torch.bfloat16 if is_bfloat16 else None
 
     @property
     def rows_at_once(self) -> int:

@@ -105,7 +105,20 @@ class HindsightLearner(GoalConditioned):
                 f"{type(self.environment).__name__} does not have: set its reward_fn, "
                 "or choose another learner"
             )
-        self.make_goals()  # or raises
+        try:
+            self.make_goals()
+        except (TypeError, ValueError) as error:
+            given = self.augmentation.get("hindsight")
+            raise ValueError(
+                f"env.augmentation.hindsight is {given}: {error}"
+            ) from error
+        share = self.settings.get("successful")
+        if share is not None and not self.environment.episodes_have_goals:
+            raise ValueError(
+                f"learner.successful is {share}, but no episode of "
+                f"{type(self.environment).__name__} has a goal of its own that it "
+                "could reach: set it to null"
+            )
 
     def make_goals(self) -> HindsightGoal:
         """Returns what draws goals in hindsight.
@@ -149,16 +162,9 @@ class HindsightLearner(GoalConditioned):
     def _make_buffer(
         self, rows: TensorDictBase, share: float | None
     ) -> TensorDictReplayBuffer:
-        environment = self.environment
         augmentation, goals = self.counterfactuals(), self.make_goals()
         options: dict[str, Any] = {}
         if share is not None:
-            if not environment.episodes_have_goals:
-                raise ValueError(
-                    f"learner.successful is {share}, but no episode of "
-                    f"{type(environment).__name__} has a goal of its own that it could "
-                    "reach: set it to null"
-                )
             options["sampler"] = ShareSampler(until_success(rows), share)
         rb = offline_buffer(rows, self.rows_at_once, sample_unit=goals, **options)
         if augmentation is not None:

@@ -103,9 +103,14 @@ class IQL(HindsightLearner):
             )
             self.parts["scheduler"] = self.scheduler
 
+    @property
+    def swaps_after_goals(self) -> bool:
+        """Whether goals are drawn before the swap, for ``lookahead: goal``."""
+        return self.settings.future_goals is not None
+
     def learning_rows(self, stored: TensorDictBase) -> TensorDictBase:
         """Returns what learning reads; goals that are drawn need no stored ones."""
-        return self.read_leaves(stored, goals=self.settings.future_goals is None)
+        return self.read_leaves(stored, goals=not self.swaps_after_goals)
 
     def make_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer; with ``future_goals``, of goals that imitation learns.
@@ -113,7 +118,7 @@ class IQL(HindsightLearner):
         These are drawn before the swap, so that ``lookahead="goal"`` can be used, and
         an action leads to the goal of every row.
         """
-        if self.settings.future_goals is None:
+        if not self.swaps_after_goals:
             return super().make_buffer(rows)
         layout = self.environment.layout
         leaves = GoalLeaves(self.environment.reward_fn, None, keys=TransformKeys())
@@ -129,7 +134,7 @@ class IQL(HindsightLearner):
 
     def make_online_buffer(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
         """Makes the buffer of collected rows, with the same goals."""
-        if self.settings.future_goals is None:
+        if not self.swaps_after_goals:
             return super().make_online_buffer(rows)
         return self.make_buffer(rows)
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
@@ -28,7 +29,7 @@ class LMP(Learner):
         windows: Count
         window: Count
         goals: dict[str, Any]
-        goal_p: Any
+        goal_p: Annotated[float, Field(gt=0, le=1)]
         plan_dim: Count
         hidden_size: Count
         decoder: Literal["open_loop", "closed_loop"]
@@ -42,6 +43,11 @@ class LMP(Learner):
         """Raises if a setting is wrong; see the base class."""
         super().check(further)
         self.make_goals()  # or raises
+
+    @property
+    def swaps_after_goals(self) -> bool:
+        """Whether goals are drawn before the swap, for ``lookahead: goal``."""
+        return True
 
     def make_goals(self) -> WindowGoal:
         """Returns what draws the goals of windows."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 __all__ = [
+    "AugmentationSettings",
     "BaseSettings",
     "BelowOne",
     "Count",
@@ -32,27 +33,48 @@ class BaseSettings(BaseModel):
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
 
-def check_settings_of(group: str, settings: DictConfig, kind: type[BaseModel]) -> None:
+class AugmentationSettings(BaseSettings):
+    """What the settings ``env.augmentation`` may be, besides those of methods."""
+
+    counterfactual_ratio: Share = 0.5
+    swap_prob: Share = 1.0
+    lookahead: Annotated[int, Field(ge=0)] | Literal["next", "goal"] | None = None
+    hindsight: dict[str, Any] = {}
+
+
+def check_settings_of(
+    group: str, settings: DictConfig | None, kind: type[BaseModel]
+) -> None:
     """Raises if settings have wrong types, are out of range or missing.
 
     Args:
         group (str): where they are in the configuration, for the error.
-        settings (DictConfig): the settings.
+        settings (DictConfig, optional): the settings; ``None`` is an error.
         kind (type): the types and ranges.
 
     Raises:
         ValueError: some are wrong; the error names all of them.
     """
+    if settings is None:
+        raise ValueError(f"{group} is null, but it should be a group of settings")
     given: dict[str, Any] = OmegaConf.to_container(settings, resolve=True)
     try:
         kind.model_validate(given)
     except ValidationError as error:
-        problems = {}
+        problems: dict[str, str] = {}
         for found in error.errors(include_url=False):
-            name, message = str(found["loc"][0]), found["msg"].replace("Input", "it")
+            name, *inner = found["loc"]
+            message = found["msg"].replace("Input", "it")
+            if inner and isinstance(inner[0], int):
+                message = f"element {inner[0]}: {message}"
             problems[name] = (
+                f"{problems[name]}, or {message}" if name in problems else message
+            )
+        raise ValueError(
+            "; ".join(
                 f"{group}.{name} is {given[name]!r}, but {message}"
                 if name in given
                 else f"{group}.{name} is missing"
+                for name, message in problems.items()
             )
-        raise ValueError("; ".join(problems.values())) from None
+        ) from None

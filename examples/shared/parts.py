@@ -71,8 +71,7 @@ def make_methods(cfg: DictConfig) -> dict[str, Method]:
 def make_learner(cfg: DictConfig, method: str) -> Learner:
     """Returns the learner ``cfg.learner`` for one of the methods."""
     cfg = cfg.copy()
-    check_learner(cfg, method)
-    learner = _unchecked(cfg, method)
+    learner = _checked(cfg, method)
     if cfg.learner.get("hidden_dtype") == "auto":
         learner.settings.hidden_dtype = hidden_dtype(cfg)
     return learner
@@ -86,17 +85,18 @@ def check_learner(cfg: DictConfig, method: str, further: int = 0) -> None:
         method (str): one of the methods.
         further (int): steps that follow in ``online.py``. Defaults to 0.
     """
+    _checked(cfg, method, further)
+
+
+def _checked(cfg: DictConfig, method: str, further: int = 0) -> Learner:
     check_settings_of("validation", cfg.validation, ValidationSettings)
-    _unchecked(cfg, method).check(further)
-
-
-def _unchecked(cfg: DictConfig, method: str) -> Learner:
     learner: Learner = get_class(cfg.learner._target_)(
         cfg.learner,
         make_environment(cfg),
         make_method(cfg, method),
         cfg.env.augmentation,
     )
+    learner.check(further)
     return learner
 
 

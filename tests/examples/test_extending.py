@@ -54,6 +54,7 @@ class SwapAnything(Method):
 LEARNER = '''
 import torch
 from learners.base import Learner
+from learners.settings import Count
 from tensordict.nn import TensorDictModule
 
 from torchrl_caiac.data import offline_buffer
@@ -61,6 +62,9 @@ from torchrl_caiac.data import offline_buffer
 
 class Cloning(Learner):
     """Behaviour cloning, linear."""
+
+    class Settings(Learner.Settings):
+        batch_size: Count
 
     def make_buffer(self, rows):
         rb = offline_buffer(rows, batch_size=self.settings.batch_size)

@@ -134,7 +134,9 @@ def test_batches_of_one_sample_are_alike(cfg, steps):
     with pytest.raises(ValueError, match=r"checkpoint_every is 5, expected a multiple"):
         steps.train.train(other, "caiac", seed=0)
     other.learner.batches_at_once = 0
-    with pytest.raises(ValueError, match="batches_at_once is 0, expected at least 1"):
+    with pytest.raises(
+        ValueError, match=r"batches_at_once is 0, but it should be .* 1"
+    ):
         steps.train.train(other, "caiac", seed=0)
 
 
@@ -386,9 +388,6 @@ def test_policies_that_are_compared(cfg, steps, compose):
         cfg.validation.policies = number
         assert candidates(cfg) == found
     assert candidates(compose("env=kitchen", "learner=lmp")) == [2000]
-    cfg.learner.steps = 3
-    with pytest.raises(ValueError, match=r"learner\.steps is 3, expected at least"):
-        candidates(cfg)
 
 
 def test_starts_are_shared_and_fresh(cfg, environment, steps):

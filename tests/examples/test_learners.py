@@ -435,7 +435,9 @@ def test_the_learning_rate_of_iql_falls_and_its_policy_has_own_sizes(configure, 
         ("diffusion_bc", "hidden_sizes=[8]", "learner.hidden_sizes is .* at least 2"),
         ("lmp", "goals=last", "learner.goals is 'last'"),
         ("lmp", "goals={last: -1}", "learner.goals is .* 'last' .* got -1"),
-        ("lmp", "goal_p=2", "learner.goals is .*: p, .* got 2"),
+        ("lmp", "goal_p=2", "learner.goal_p is 2"),
+        ("td3", "hidden_sizes=[8,0]", r"is \[8, 0\], but element 1: it should be"),
+        ("bc", "future_goals=last", "learner.future_goals is 'last'"),
         ("lmp", "decoder=open", "learner.decoder is 'open'"),
         ("lmp", "kl_weight=.nan", "learner.kl_weight is nan"),
         ("iql", "temperature=-1", "learner.temperature is -1"),
@@ -470,23 +472,40 @@ def test_wrong_settings_are_refused_before_anything_is_written(
 @pytest.mark.parametrize(
     ("option", "match"),
     [
-        ("env.augmentation.counterfactual_ratio=2", "counterfactual_ratio must be"),
-        ("env.augmentation.swap_prob=often", "swap_prob must be a number"),
-        ("env.augmentation.lookahead=-1", "lookahead"),
-        ("validation.policies=0", "validation.policies is 0"),
+        ("counterfactual_ratio=2", "env.augmentation.counterfactual_ratio is 2"),
+        ("swap_prob=often", "env.augmentation.swap_prob is 'often'"),
+        ("lookahead=-1", "lookahead is -1, but it should be .* 0, or it should be 'ne"),
+        ("lookahead=goal", "lookahead is 'goal', but learner=td3 draws no goals"),
     ],
 )
-def test_settings_of_augmentation_and_validation(option, match, configure, steps):
-    cfg = configure("fetch_push", "td3", option)
-    with pytest.raises((TypeError, ValueError), match=match):
-        steps.train.train(cfg, "motion", 0)
-    assert not steps.parts.run_folder(cfg, "motion", 0).exists()
+@pytest.mark.parametrize("method", ["motion", "none"])
+def test_settings_of_the_augmentation(option, match, method, configure, steps):
+    cfg = configure("fetch_push", "td3", f"env.augmentation.{option}", method=method)
+    if option == "lookahead=goal" and method == "none":
+        steps.parts.check_learner(cfg, method)  # without effect
+        return
+    with pytest.raises(ValueError, match=match):
+        steps.train.train(cfg, method, 0)
+    assert not steps.parts.run_folder(cfg, method, 0).exists()
+
+
+def test_policies_to_validate(configure, steps):
+    for option in ("validation.policies=0", "validation=null"):
+        cfg = configure("fetch_push", "td3", option)
+        with pytest.raises(ValueError, match="validation"):
+            steps.parts.check_learner(cfg, "motion")
+
+
+def test_a_method_that_refuses_its_threshold(configure, steps):
+    cfg = configure("fetch_push", "td3", "method.caiac.threshold=-1", method="caiac")
+    with pytest.raises(ValueError, match=r"env.augmentation, or the method: threshold"):
+        steps.parts.check_learner(cfg, "caiac")
 
 
 def test_goals_of_hindsight_are_checked_first(configure, steps):
     cfg = configure("fetch_push", "td3")
     OmegaConf.update(cfg, "env.augmentation.hindsight", {"future": 2}, force_add=True)
-    with pytest.raises(ValueError, match="future must be in"):
+    with pytest.raises(ValueError, match=r"hindsight is .*: future must be in"):
         steps.parts.check_learner(cfg, "motion")
 
 

@@ -321,6 +321,14 @@ class TestAnEditedStudy:
         assert {row["step"] for row in rows} == {"10", "20", "30"}
         assert len(rows) == 8 * 2 * 4
 
+    def test_wrong_settings_remove_no_results(self, study):
+        study.run()
+        before = study.table.read_bytes()
+        study.write(arms=[{**STUDY["arms"][0], "overrides": ["learner.log_every=0"]}])
+        with pytest.raises(ValueError, match=r"4, .*, seed 0: learner.log_every is 0"):
+            study.run("stale=recompute")
+        assert study.table.read_bytes() == before
+
     def test_some_settings_and_seeds(self, study):
         study.run()
         settings = {

@@ -116,7 +116,8 @@ def _mlp(
     hidden_dtype: torch.dtype | None,
     layer_norm: bool = False,
 ) -> _MLP:
-    is_sequence = isinstance(hidden_sizes, Sequence) and type(hidden_sizes) is not bytes
+    is_text = isinstance(hidden_sizes, (str, bytes, bytearray))
+    is_sequence = isinstance(hidden_sizes, Sequence) and not is_text
     sizes = list(hidden_sizes) if is_sequence else []
     if not sizes or any(type(size) is not int or size < 1 for size in sizes):
         raise ValueError(
@@ -153,10 +154,13 @@ def _low_and_span(
     """Returns the smallest action and the width of its range, each ``[size]``."""
     try:  # on the CPU, since a value of a meta device cannot be compared
         least, most = (
-            torch.as_tensor(x, dtype=torch.float32, device="cpu").expand(size).clone()
+            torch.as_tensor(x, dtype=torch.float32, device="cpu")
+            .expand(size)
+            .detach()
+            .clone()
             for x in (low, high)
         )
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         least = most = torch.zeros(size, device="cpu")
     span = most - least
     if not ((span > 0) & span.isfinite()).all():
