@@ -143,11 +143,11 @@ class Learner(ABC):
         settings = self.settings
         check_settings_of("learner", settings, self.Settings)
         check_settings_of("env.augmentation", self.augmentation, AugmentationSettings)
-        # Policies of a run that goes on in online.py need not be kept.
-        if not further and (settings.keep_every or 1) > settings.steps:
+        if (settings.keep_every or 1) > settings.steps:
             raise ValueError(
                 f"learner.keep_every is {settings.keep_every}, expected at most "
-                f"learner.steps, {settings.steps}: no policy would be kept"
+                f"learner.steps, {settings.steps}, or null for the last policy: none "
+                "would be kept"
             )
         for name in ("steps", "checkpoint_every"):
             if settings[name] % self.at_once:

@@ -80,6 +80,7 @@ def test_results_of_a_run_replace_those_before(steps, tmp_path):
         ("td3_bc", ["online.steps=1.5"], "online.steps is 1.5"),
         ("td3_bc", ["online.offline_fraction=2"], "online.offline_fraction is 2"),
         ("td3_bc", ["learner.lr=-1"], "learner.lr is -1"),
+        ("iql", ["learner.steps=2000"], "learner.keep_every is 4000, .* or null"),
         ("td3_bc", ["online.offline_fraction=1"], "online.offline_fraction is 1"),
         ("td3_bc", ["seeds=[0,-1]"], "seeds is .*, but element 1: it should be"),
         ("td3_bc", ["env=kitchen"], "collects in Fetch-Push only"),
