@@ -55,6 +55,15 @@ def test_nested_layouts_and_named_agents() -> None:
         DistanceInfluence(layout, {"arm": [1], "cup": [3]}, agent="cup")(td)
 
 
+def test_positions_of_the_layout() -> None:
+    layout = EntityLayout(LAYOUT.columns, fixed=["arm"], positions=PLACES)
+    x = TensorDict({"observation": torch.rand(20, 10) * 0.3}, [20])
+    rule = DistanceInfluence(layout)
+    assert torch.equal(rule(x), DistanceInfluence(LAYOUT, PLACES)(x))
+    with pytest.raises(ValueError, match=r"the layout's positions name \[\], expected"):
+        DistanceInfluence(LAYOUT)
+
+
 def test_scores_the_state_after_the_last_row() -> None:
     layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
     rule = DistanceInfluence(layout, {"arm": [0], "cup": [1]})

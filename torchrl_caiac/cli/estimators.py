@@ -106,10 +106,7 @@ def _residual(context: Context) -> ResidualInfluence:
 
 def _distance(context: Context) -> DistanceInfluence:
     return DistanceInfluence(
-        context.layout,
-        context.layout.positions,
-        distance=context.settings["distance"],
-        action_only=True,
+        context.layout, distance=context.settings["distance"], action_only=True
     )
 
 

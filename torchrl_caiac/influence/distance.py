@@ -60,10 +60,11 @@ class DistanceInfluence(nn.Module):
 
     Args:
         layout (EntityLayout): the entities.
-        positions (mapping of str to iterable of int): the columns of each entity's
-            position, the same number for all, in the same order and unit. In flat
-            layouts these are observation columns of the entity, in nested layouts
-            places in the entity's flattened features.
+        positions (mapping of str to iterable of int, optional): the columns of each
+            entity's position, the same number for all, in the same order and unit. In
+            flat layouts these are observation columns of the entity, in nested layouts
+            places in the entity's flattened features. Defaults to
+            ``layout.positions``.
         agent (str, optional): the entity that the action moves. Defaults to the
             layout's only ``fixed`` one.
         distance (float): the largest distance of linked entities, in the unit of the
@@ -93,7 +94,7 @@ class DistanceInfluence(nn.Module):
     def __init__(
         self,
         layout: EntityLayout,
-        positions: Mapping[str, Iterable[int]],
+        positions: Mapping[str, Iterable[int]] | None = None,
         agent: str | None = None,
         distance: float = 0.1,
         *,
@@ -101,10 +102,12 @@ class DistanceInfluence(nn.Module):
     ) -> None:
         super().__init__()
         self.layout = layout
-        self.positions = {name: tuple(columns) for name, columns in positions.items()}
+        given = layout.positions if positions is None else positions
+        self.positions = {name: tuple(columns) for name, columns in given.items()}
         if set(self.positions) != set(layout.names):
+            whose = "the layout's positions" if positions is None else "positions"
             raise ValueError(
-                f"positions name {sorted(self.positions)}, expected all entities "
+                f"{whose} name {sorted(self.positions)}, expected all entities "
                 f"{list(layout.names)}: give the columns of each position"
             )
         sizes = {name: len(columns) for name, columns in self.positions.items()}

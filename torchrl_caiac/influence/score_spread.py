@@ -61,7 +61,8 @@ def warn_of_one_side(scores: torch.Tensor, layout: EntityLayout) -> None:
         ...     warn_of_one_side(torch.full((200, 1), 0.3), EntityLayout({"cup": [0]}))
         >>> print(caught[0].message)
         with the default threshold 0.05, nothing of 'cup' (all scores are 0.3) would be
-        swapped. Choose thresholds with suggest_thresholds(rb, layout)
+        swapped. Choose thresholds with suggest_thresholds(rb, layout), or pass
+        CAIACTransform(layout, threshold="auto")
     """
     low, high, rows = score_limits(scores)
     if rows < _FEWEST_ROWS:
@@ -91,6 +92,7 @@ def warn_of_one_side(scores: torch.Tensor, layout: EntityLayout) -> None:
     if found:
         warnings.warn(
             f"with the default threshold {DEFAULT_THRESHOLD}, {'; '.join(found)}. "
-            "Choose thresholds with suggest_thresholds(rb, layout)",
+            "Choose thresholds with suggest_thresholds(rb, layout), or pass "
+            'CAIACTransform(layout, threshold="auto")',
             stacklevel=4,
         )
