@@ -45,7 +45,7 @@ from learners.settings import (
 )
 from score import make_scoring
 from shared.console import Console
-from shared.parts import check_learner, make_environment, run_folder
+from shared.parts import check_learner, make_environment, make_method, run_folder
 from shared.settings import keep_settings
 from study import prepare
 from torchrl_caiac._figures import colour, finish_results, new_figure
@@ -93,6 +93,11 @@ def check(cfg: DictConfig, method: str) -> None:
         raise ValueError(
             f"learner={cfg.learner.name} learns from demonstrations only: choose td3, "
             "td3_bc or iql"
+        )
+    if settings.episodes and "truth" in make_method(cfg, method).env_settings:
+        raise ValueError(
+            f"method={method} reads states of the simulator, which collected episodes "
+            "do not have: choose another method, or online.episodes=0"
         )
     workers = min(settings.workers, settings.episodes)
     if workers and settings.episodes % workers:

@@ -19,7 +19,7 @@ from fit import fit_model
 from methods.base import Scoring
 from methods.caiac import CAIAC
 from shared.console import progress, start
-from shared.parts import make_environment, make_learner, make_methods
+from shared.parts import make_environment, make_methods, new_learner
 from shared.settings import keep_settings
 from torchrl_caiac._files import whole_file, write_json
 from torchrl_caiac.data import offline_buffer
@@ -55,7 +55,7 @@ def score(cfg: DictConfig) -> dict[str, Any]:
     methods = make_methods(cfg)
     keys = {str(method.score_key): name for name, method in methods.items()}
     for name in keys.values():  # methods with the same scores are scored once
-        rows = make_learner(cfg, name).stored_rows()
+        rows = new_learner(cfg, name).stored_rows()
         methods[name].score(offline_buffer(rows, batch_size=1), scoring)
     return check_scores(cfg, scoring) if "caiac" in methods else {}
 

@@ -271,10 +271,17 @@ def missing_runs(options: Options, runs: Sequence[Run]) -> list[Run]:
 
     Raises:
         ValueError: the table has results of other settings, or of runs that the study
-            does not have.
+            does not have; or a setting is wrong of a run that is wanted, or whose
+            results would be removed.
     """
     rows = read_rows(options.table)
     states = {run.key: state_of(run, rows) for run in runs}
+    for job in runs:
+        if options.wanted(job) or states[job.key] == "stale":
+            try:
+                check_learner(job.cfg, job.method)
+            except ValueError as error:
+                raise ValueError(f"{job}: {error}") from error
     stale = [run.key for run in runs if states[run.key] == "stale"]
     stale += unlisted(runs, rows)
     if stale and options.stale == "refuse":
@@ -311,11 +318,6 @@ def run_study(options: Options, console: Console) -> None:
     """Does what is missing, writes the results and figures, and prints them."""
     study = options.study
     runs = study.runs()
-    for job in filter(options.wanted, runs):
-        try:
-            check_learner(job.cfg, job.method)
-        except ValueError as error:
-            raise ValueError(f"{job}: {error}") from error
     missing = missing_runs(options, runs)  # removes outdated results if asked
     needed = preparations(missing)
     console.stages = {0: 1, 1: 5}.get(len(needed), 3)

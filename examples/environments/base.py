@@ -67,6 +67,8 @@ class Environment(ABC):
     """Rewards of achieved and desired goals, -1 or 0; ``None`` where it has none."""
     episodes_have_goals: ClassVar[bool] = True
     """Whether an episode was recorded to reach its goal, so that it can succeed."""
+    demonstrations_have_goals: ClassVar[bool] = True
+    """Whether :meth:`demonstrations` have the goals of their episodes."""
     data_name: ClassVar[str] = "data"
     """The name of the data in the list of stages."""
     success_key: ClassVar[str] = "success"
@@ -86,6 +88,15 @@ class Environment(ABC):
     def folder(self) -> Path:
         """The folder of everything that depends on the training data."""
         return self.out
+
+    def check(self) -> None:  # noqa: B027
+        """Raises if a setting of the evaluation is wrong, before anything is collected.
+
+        Defaults to no check.
+        """
+
+    def check_demonstrations(self) -> None:  # noqa: B027
+        """Raises if the settings leave no demonstrations. Defaults to no check."""
 
     @abstractmethod
     def collect(self, *, progress: bool = False) -> None:

@@ -58,11 +58,21 @@ class Kitchen(Environment):
     layout = LAYOUT
     action_dim = 9
     data_name = "demonstrations"
+    demonstrations_have_goals = False
 
     @staticmethod
     def reward_fn(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
         """Returns 0 where all objects are at their goals, else -1."""
         return kitchen_reward(achieved, desired) - 1.0
+
+    def check(self) -> None:
+        """Raises if a task is not known, or the splits have starts in common."""
+        tasks = list(self.settings.evaluate.tasks)
+        if not tasks or not set(tasks) <= set(KITCHEN_TASKS):
+            raise ValueError(
+                f"env.evaluate.tasks is {tasks}, expected some of {list(KITCHEN_TASKS)}"
+            )
+        self.start_seeds(0, "test")  # or raises
 
     def collect(self, *, progress: bool = False) -> None:
         """Collects what is missing of the three datasets, as transitions too."""

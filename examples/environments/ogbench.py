@@ -1,4 +1,4 @@
-"""OGBench's scenes: data of its oracles, its evaluation tasks, its success."""
+"""OGBench's scenes: data of its scripted policies, its tasks, its success."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ HANDLES = {"drawer": "drawer_handle_center", "window": "window_handle_center"}
 
 
 class OGBench(Environment):
-    """Data of OGBench's own oracles, and its five tasks with its success.
+    """Data of OGBench's own scripted policies, and its five tasks with its success.
 
     The goals are those of OGBench's variant ``oraclerep``: what the task is about, such
     as the positions of the cubes. In OGBench's other datasets the goal is a whole
@@ -63,6 +63,7 @@ class OGBench(Environment):
 
     action_dim = 5
     episodes_have_goals = False
+    demonstrations_have_goals = False
     data_name: ClassVar[str] = "play data"
     goal_reference = "robot"
 
@@ -102,6 +103,10 @@ class OGBench(Environment):
                 "(env.collect.episodes), or null for all"
             )
         self._envs: list[Any] = []
+
+    def check(self) -> None:
+        """Raises if a task is not known, or the splits have starts in common."""
+        self._seeds("test")
 
     @property
     def folder(self) -> Path:
@@ -192,9 +197,7 @@ class OGBench(Environment):
         """Returns the rule of distance between the hand and the entities, 5 cm."""
         if not self.settings.scene.startswith("cube-"):
             return HandleDistance(self.settings.scene, action_only=action_only)
-        return DistanceInfluence(
-            self.layout, self.layout.positions, distance=0.5, action_only=action_only
-        )
+        return DistanceInfluence(self.layout, distance=0.5, action_only=action_only)
 
     def play(
         self,

@@ -172,7 +172,8 @@ class Learner(ABC):
                 "env.augmentation.lookahead is 'goal', but "
                 f"learner={self.settings.name} draws no goals before the swap: set it "
                 "to next, or learner.goals=future or learner.future_goals if the "
-                "learner has it"
+                "learner has it. (A learner of your own that draws them has the "
+                "property swaps_after_goals.)"
             )
 
     @property

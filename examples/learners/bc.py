@@ -38,11 +38,14 @@ class BC(GoalConditioned):
     def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong; see the base class."""
         super().check(further)
-        future_goals(self, self.window)  # or raises
-        if not self.swaps_after_goals and not self.environment.episodes_have_goals:
+        environment = self.environment
+        environment.check_demonstrations()
+        if self.swaps_after_goals or self.settings.future_goals is not None:
+            future_goals(self, self.window)  # or raises
+        if not (self.swaps_after_goals or environment.demonstrations_have_goals):
             raise ValueError(
-                "learner.goals is 'own', but no episode of "
-                f"{type(self.environment).__name__} has a goal of its own: set it to "
+                "learner.goals is 'own', but the demonstrations of "
+                f"{type(environment).__name__} have no goals of their own: set it to "
                 "future"
             )
 

@@ -110,7 +110,8 @@ class HindsightLearner(GoalConditioned):
         except (TypeError, ValueError) as error:
             given = self.augmentation.get("hindsight")
             raise ValueError(
-                f"env.augmentation.hindsight is {given}: {error}"
+                f"env.augmentation.hindsight is {given}: {error} (without "
+                "counterfactuals, random is half of counterfactual_ratio)"
             ) from error
         share = self.settings.get("successful")
         if share is not None and not self.environment.episodes_have_goals:
@@ -130,7 +131,7 @@ class HindsightLearner(GoalConditioned):
         """
         environment, augmentation = self.environment, self.augmentation
         random = 0.5 if self.settings.get("random_goals", True) else 0.0
-        share = augmentation.counterfactual_ratio
+        share = augmentation.get("counterfactual_ratio", 0.5)
         return HindsightGoal(
             environment.layout,
             environment.reward_fn,

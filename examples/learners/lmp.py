@@ -42,6 +42,7 @@ class LMP(Learner):
     def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong; see the base class."""
         super().check(further)
+        self.environment.check_demonstrations()
         self.make_goals()  # or raises
 
     @property

@@ -38,25 +38,24 @@ class AugmentationSettings(BaseSettings):
 
     counterfactual_ratio: Share = 0.5
     swap_prob: Share = 1.0
+    threshold: float | dict[str, float] = 0.05
     lookahead: Annotated[int, Field(ge=0)] | Literal["next", "goal"] | None = None
     hindsight: dict[str, Any] = {}
 
 
-def check_settings_of(
-    group: str, settings: DictConfig | None, kind: type[BaseModel]
-) -> None:
+def check_settings_of(group: str, settings: Any, kind: type[BaseModel]) -> None:
     """Raises if settings have wrong types, are out of range or missing.
 
     Args:
         group (str): where they are in the configuration, for the error.
-        settings (DictConfig, optional): the settings; ``None`` is an error.
+        settings (Any): the settings; an error if they are no ``DictConfig``.
         kind (type): the types and ranges.
 
     Raises:
         ValueError: some are wrong; the error names all of them.
     """
-    if settings is None:
-        raise ValueError(f"{group} is null, but it should be a group of settings")
+    if not isinstance(settings, DictConfig):
+        raise ValueError(f"{group} is {settings}, but it should be a group of settings")
     given: dict[str, Any] = OmegaConf.to_container(settings, resolve=True)
     try:
         kind.model_validate(given)

@@ -29,6 +29,7 @@ __all__ = [
     "make_learner",
     "make_method",
     "make_methods",
+    "new_learner",
     "policy_file",
     "run_folder",
 ]
@@ -41,6 +42,13 @@ class ValidationSettings(BaseSettings):
     """What the settings ``validation`` may be."""
 
     policies: Count | None
+
+
+class EvaluateSettings(BaseSettings):
+    """What the settings ``env.evaluate`` may be, besides those of environments."""
+
+    episodes: Count = 1
+    validation_episodes: Count = 1
 
 
 def make_environment(cfg: DictConfig) -> Environment:
@@ -68,6 +76,21 @@ def make_methods(cfg: DictConfig) -> dict[str, Method]:
     return {name: make_method(cfg, name) for name in cfg.method}
 
 
+def new_learner(cfg: DictConfig, method: str) -> Learner:
+    """Returns the learner ``cfg.learner`` for one of the methods, not checked.
+
+    It can read rows, but not train: the methods of runs with the same data are scored
+    with the settings of one of them.
+    """
+    learner: Learner = get_class(cfg.learner._target_)(
+        cfg.learner,
+        make_environment(cfg),
+        make_method(cfg, method),
+        cfg.env.augmentation,
+    )
+    return learner
+
+
 def make_learner(cfg: DictConfig, method: str) -> Learner:
     """Returns the learner ``cfg.learner`` for one of the methods."""
     cfg = cfg.copy()
@@ -90,12 +113,9 @@ def check_learner(cfg: DictConfig, method: str, further: int = 0) -> None:
 
 def _checked(cfg: DictConfig, method: str, further: int = 0) -> Learner:
     check_settings_of("validation", cfg.validation, ValidationSettings)
-    learner: Learner = get_class(cfg.learner._target_)(
-        cfg.learner,
-        make_environment(cfg),
-        make_method(cfg, method),
-        cfg.env.augmentation,
-    )
+    check_settings_of("env.evaluate", cfg.env.evaluate, EvaluateSettings)
+    learner = new_learner(cfg, method)
+    learner.environment.check()
     learner.check(further)
     return learner
 

@@ -77,11 +77,15 @@ def add_rows(path: str | os.PathLike[str], rows: Iterable[Mapping[str, Any]]) ->
 
     The file is replaced as a whole: a process that is killed leaves the old or the new
     one. A row of the same evaluation, task and measure is replaced.
+
+    Raises:
+        ValueError: a value is not a finite number; nothing is written.
     """
-    new = {
-        tuple(row[name] for name in _KEY): row
-        for row in ({name: _cell(row[name]) for name in COLUMNS} for row in rows)
-    }
+    new = {}
+    for row in ({name: _cell(row[name]) for name in COLUMNS} for row in rows):
+        if not _has_numbers(row):
+            raise ValueError(f"a result has no finite number in {_NUMBERS}: {row}")
+        new[tuple(row[name] for name in _KEY)] = row
     with _changed(path) as kept:
         kept[:] = [r for r in kept if tuple(r[name] for name in _KEY) not in new]
         kept += new.values()

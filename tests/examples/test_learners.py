@@ -490,10 +490,41 @@ def test_settings_of_the_augmentation(option, match, method, configure, steps):
 
 
 def test_policies_to_validate(configure, steps):
-    for option in ("validation.policies=0", "validation=null"):
+    for option in ("validation.policies=0", "validation=null", "validation=5"):
         cfg = configure("fetch_push", "td3", option)
         with pytest.raises(ValueError, match="validation"):
             steps.parts.check_learner(cfg, "motion")
+
+
+@pytest.mark.parametrize(
+    ("env", "learner", "option", "match"),
+    [
+        ("fetch_push", "td3", "env.evaluate.episodes=0", "env.evaluate.episodes is 0"),
+        ("fetch_push", "td3", "env.evaluate.validation_episodes=0", "episodes is 0"),
+        ("fetch_push", "bc", "env.demonstrations=null", "demonstrations is null"),
+        ("fetch_push", "lmp", "env.demonstrations=null", "demonstrations is null"),
+        ("fetch_push_sliding", "bc", "out=unused", "demonstrations is null"),
+        ("kitchen", "bc", "learner.goals=own", "Kitchen have no goals of their own"),
+        ("kitchen", "bc", "env.evaluate.tasks=[kettl]", r"tasks is \['kettl'\]"),
+        ("kitchen", "bc", "env.evaluate.tasks=[]", r"tasks is \[\], expected some"),
+        ("kitchen", "bc", "env.evaluate.validation_seed=5", "raise env.evaluate"),
+        ("fetch_push", "bc", "env.augmentation.threshold=auto", "threshold is 'auto'"),
+    ],
+)
+def test_settings_of_the_environment(env, learner, option, match, compose, steps):
+    cfg = compose(f"env={env}", f"learner={learner}", "method=[motion]", option)
+    with pytest.raises(ValueError, match=match):
+        steps.parts.check_learner(cfg, "motion")
+
+
+@pytest.mark.parametrize("learner", ["bc", "td3"])
+def test_settings_that_may_be_missing(learner, compose, steps):
+    missing = "~env.augmentation.counterfactual_ratio"
+    cfg = compose(f"learner={learner}", "env=fetch_push", "method=[none]", missing)
+    steps.parts.check_learner(cfg, "none")
+    if learner == "bc":
+        cfg.learner.future_goals = None  # which goals of its own do not read
+        steps.parts.check_learner(cfg, "none")
 
 
 def test_a_method_that_refuses_its_threshold(configure, steps):

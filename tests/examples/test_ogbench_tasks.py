@@ -387,6 +387,8 @@ def test_wrong_settings_of_the_evaluation(wrong, match, steps, compose, tmp_path
     cfg = compose("env=ogbench_cube_double_play", out=tmp_path)
     environment = steps.parts.make_environment(changed(cfg, evaluate=wrong))
     with pytest.raises(ValueError, match=match):
+        environment.check()
+    with pytest.raises(ValueError, match=match):
         environment.play(Still(), 0, tmp_path)
     with pytest.raises(ValueError, match="split is 'train'"):
         environment.play(Still(), 0, tmp_path, split="train")

@@ -85,6 +85,8 @@ def test_results_of_a_run_replace_those_before(steps, tmp_path):
         ("td3_bc", ["seeds=[0,-1]"], "seeds is .*, but element 1: it should be"),
         ("td3_bc", ["env=kitchen"], "collects in Fetch-Push only"),
         ("td3_bc", ["env=fetch_push_sliding"], "collects in Fetch-Push only"),
+        ("td3", ["method=[oracle]"], "method=oracle reads states of the simulator"),
+        ("td3", ["online=5"], "online is 5, but it should be a group"),
         ("bc", [], "learner=bc learns from demonstrations only"),
         ("lmp", [], "learner=lmp learns from demonstrations only"),
     ],
@@ -95,5 +97,5 @@ def test_wrong_settings_are_refused_first(
     cfg = compose(f"learner={learner}", *options, config="online")
     cfg.out = str(tmp_path)
     with pytest.raises(ValueError, match=match):
-        next(steps.online.run(cfg, "none", 0))
+        next(steps.online.run(cfg, next(iter(cfg.method)), 0))
     assert not [*tmp_path.iterdir()]

@@ -96,6 +96,11 @@ class Other(NoAugmentation):
 class Counting(Learner):
     """A weight that grows by one in each step."""
 
+    def check(self, further=0):
+        super().check(further)
+        if isinstance(self.method, Other) and self.augmentation.swap_prob < 1:
+            raise ValueError("other needs swap_prob=1")
+
     def make_buffer(self, rows):
         raise NotImplementedError
 
@@ -133,7 +138,7 @@ title: nothing
 collect: {rows: 4, seed: 0}
 score: {batch_size: 1, smoothing: 1}
 world_model: {steps: 1}
-augmentation: {counterfactual_ratio: 0.5, threshold: 0.5}
+augmentation: {counterfactual_ratio: 0.5, swap_prob: 1.0, threshold: 0.5}
 evaluate: {episodes: 5, validation_episodes: 4}
 """,
     "conf/learner/counting.yaml": """
@@ -329,6 +334,26 @@ class TestAnEditedStudy:
             study.run("stale=recompute")
         assert study.table.read_bytes() == before
 
+    def test_wrong_settings_of_runs_that_are_not_asked_for_remove_none(self, study):
+        study.run()
+        before = study.table.read_bytes()
+        arms = [
+            {
+                **STUDY["arms"][0],
+                "methods": ["none"],
+                "overrides": ["learner.steps=30"],
+            },
+            {
+                **STUDY["arms"][0],
+                "methods": ["other"],
+                "overrides": ["learner.steps=0"],
+            },
+        ]
+        study.write(arms=arms)
+        with pytest.raises(ValueError, match=r"other, seed 0: learner.steps is 0"):
+            study.run("methods=none", "stale=recompute")
+        assert study.table.read_bytes() == before
+
     def test_some_settings_and_seeds(self, study):
         study.run()
         settings = {
@@ -359,6 +384,21 @@ class TestAnEditedStudy:
         }
         checkpoints = list(study.root.rglob("checkpoint.zip"))
         assert len(checkpoints) == 4  # not trained again
+
+
+def test_methods_with_the_same_data_may_have_other_augmentations(study):
+    """Both are scored with the settings of the first, which the second refuses."""
+    arm = STUDY["arms"][0]
+    swaps = "env.augmentation.swap_prob=0.5"
+    study.write(
+        arms=[
+            {**arm, "methods": ["none"], "overrides": [swaps]},
+            {**arm, "methods": ["other"]},
+        ]
+    )
+    study.run()
+    assert cells(study.rows()) == expected()
+    assert study.collections() == 2  # of two settings
 
 
 def test_a_run_that_fails_leaves_the_others(study):
@@ -454,6 +494,15 @@ class TestTable:
         before = path.read_bytes()
         with pytest.raises(ValueError, match=rf"a\.csv.* {message}"):
             steps.results.add_rows(path, [self.row(seed=2)])
+        assert path.read_bytes() == before
+
+    @pytest.mark.parametrize("value", [float("nan"), float("inf"), "success"])
+    def test_results_are_finite_numbers(self, steps, tmp_path, value):
+        path = tmp_path / "a.csv"
+        steps.results.add_rows(path, [self.row()])
+        before = path.read_bytes()
+        with pytest.raises(ValueError, match="a result has no finite number"):
+            steps.results.add_rows(path, [self.row(seed=2, value=value)])
         assert path.read_bytes() == before
 
 
