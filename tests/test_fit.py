@@ -519,13 +519,13 @@ def test_the_unit_of_the_actions_does_not_matter(scale: float) -> None:
 
 def test_actions_outside_of_the_bounds_are_refused() -> None:
     data = world(400)
-    data["action"][123, 1] = 1.001
-    message = r"'action' is 1\.001 in column 1 of row 123, expected \[-1, 1\] \(1 such"
+    data["action"][123, 1] = 1.005
+    message = r"'action' is 1\.005 in column 1 of row 123, expected \[-1, 1\] \(1 such"
     with pytest.raises(ValueError, match=message):
         fit(make(), data, action_spec=SPEC)
     with pytest.raises(ValueError, match="column 1 of row 523"):
         fit(make(), [world(400), data], action_spec=SPEC)
-    data["action"][123, 1] = 1.0001  # rounding
+    data["action"][123, 1] = 1.001  # rounding
     fit(make(), data, action_spec=SPEC)
     with pytest.raises(TypeError, match="Bounded spec, got Unbounded"):
         fit(make(), data, action_spec=Unbounded((2,)))
@@ -582,3 +582,34 @@ def test_checkpoints_record_the_bounds(tmp_path: Path) -> None:
     del old["action_low"], old["action_high"]
     with pytest.raises(ValueError, match="is of an earlier version"):
         make().load_state_dict(old)
+
+
+def test_discrete_actions_are_refused() -> None:
+    data = world(60)
+    data["action"] = torch.nn.functional.one_hot(torch.arange(60) % 2)
+    with pytest.raises(ValueError, match=r"'action' is one-hot .* MotionInfluence"):
+        fit(make(), data)
+    with pytest.raises(ValueError, match=r"\[60\], expected \[60, 2\]: store them as"):
+        fit(make(), data.set("action", torch.arange(60) % 2))
+
+
+def test_corrected_trajectories_are_other_data(tmp_path: Path) -> None:
+    data, path = world(400), tmp_path / "model"
+    fit(make(), data, checkpoint=path)
+    data["episode"] = data["episode"].flip(0)
+    with pytest.raises(ValueError, match="data_checksum"):
+        fit(make(), data, checkpoint=path)
+
+
+def test_a_floor_from_the_data_is_checked(caplog: pytest.LogCaptureFixture) -> None:
+    """Positions of objects in other units raise the floor of an entity that moves."""
+    data = world(400)
+    layout = EntityLayout(
+        {"arm": [0, 1], "cup": [2, 3]}, positions={"arm": [0, 1], "cup": [2, 3]}
+    )
+    for key in ("observation", ("next", "observation")):
+        data[key][:, :2] *= 50
+    model = GaussianWorldModel(layout, 2, (8,), variance_floor="auto")
+    with caplog.at_level("WARNING"):
+        fit(model, data)
+    assert "floor_too_high" in caplog.text

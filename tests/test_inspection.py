@@ -279,3 +279,18 @@ def test_goals_that_equal_columns_are_mapped() -> None:
     other = inspect_dataset(data)
     assert other.proposal is not None and not other.proposal.goal
     assert any("name goal and achieved" in note for note in other.notes)
+
+
+def test_the_goal_of_one_object() -> None:
+    data = clean()
+    data["achieved_goal"] = data["achieved_goal"][:, :2].clone()
+    data["desired_goal"] = data["desired_goal"][:, :2].clone()
+    found = inspect_dataset(data)
+    assert found.proposal is not None
+    assert sorted(map(len, found.proposal.goal.values())) == [0, 2]
+
+
+def test_discrete_actions() -> None:
+    data = clean()
+    found = inspect_dataset(data.set("action", (data["action"][:, 0] > 0).long()))
+    assert found.proposal is not None

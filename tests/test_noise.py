@@ -173,3 +173,37 @@ def test_what_cannot_be_measured_is_refused() -> None:
         resting_noise(data, layout, max_rows=0)
     with pytest.raises(KeyError, match="next"):
         resting_noise(data.exclude("next"), layout)
+
+
+@pytest.mark.parametrize("offset", [0.0, 5e5])
+def test_motion_far_from_zero(offset: float) -> None:
+    """Positions in double precision, such as UTM coordinates in metres."""
+    change = torch.zeros(400, 1, dtype=torch.float64)
+    change[::4] = 0.05
+    data = transitions(change, offset + change.cumsum(0))
+    found = resting_noise(data, EntityLayout({"cup": [0]}))["cup"]
+    assert found.rest_share == 0.75
+    assert found.tolerance[0] < 0.05
+    single = resting_noise(data.float(), EntityLayout({"cup": [0]}))["cup"]
+    assert (single.tolerance[0] < 0.05) == (offset == 0)  # which cannot hold it
+
+
+def test_integers_have_no_rounding() -> None:
+    change = torch.zeros(400, 1, dtype=torch.int64)
+    change[::4] = 3
+    data = transitions(change, change.cumsum(0) + 10**9)
+    found = resting_noise(data, EntityLayout({"cup": [0]}))["cup"]
+    assert found.rest_share == 0.75 and found.tolerance[0] < 3
+
+
+def test_joint_angles_are_not_compared_with_positions() -> None:
+    generator = torch.Generator().manual_seed(0)
+    change = torch.randn(2000, 5, generator=generator)  # degrees, and metres
+    change[:, 2:] *= 3e-3 * moves(0.2, generator)[:2000]
+    names = {"arm": [0, 1], "cup": [2, 3, 4]}
+    layout = EntityLayout(names, fixed=["arm"], positions=names)
+    found = resting_noise(transitions(change), layout)["cup"]
+    assert max(found.floor) < 1e-3
+    same = {"arm": [0, 1, 2], "cup": [3, 4]}  # as many numbers: maybe one frame
+    other = EntityLayout(same, positions=same)
+    assert max(resting_noise(transitions(change), other)["cup"].floor) > 3e-3

@@ -384,7 +384,7 @@ def test_mixture(
 @in_memory
 def test_coda(scored: TensorDictBase) -> None:
     rb = offline_buffer(scored, batch_size=8)
-    model = TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8)
+    model = ready(TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8))
     run_how_to("attention = ", rb=rb, transformer=model)
     assert rb.sample()["coda", "graph"].shape == (8, 4, 3)
     assert rb.sample()["caiac", "swapped"].shape == (8, 3)
@@ -392,7 +392,7 @@ def test_coda(scored: TensorDictBase) -> None:
 
 @in_memory
 def test_comparison_of_estimators(flat_data: TensorDictBase) -> None:
-    transformer = TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8)
+    transformer = ready(TransformerWorldModel(LAYOUT, 2, layers=1, heads=2, width=8))
     influenced = torch.rand(len(flat_data), 3) < 0.5
     table = run_how_to(
         "table = ",

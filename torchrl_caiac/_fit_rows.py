@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._keys import floating, get_leaf
-from torchrl_caiac.modules._action_bounds import check_actions
+from torchrl_caiac.modules._action_bounds import check_actions, is_one_hot
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 from torchrl_caiac.trajectories import trajectory_index
 
@@ -53,6 +53,7 @@ class FitRows:
             torch.full((model.action_dim,), math.inf),
             torch.full((model.action_dim,), -math.inf),
         )
+        is_discrete = True
         for first, part in self._chunks():
             action = part.split(self.sizes, 1)[1]
             self.action_range = (
@@ -60,8 +61,15 @@ class FitRows:
                 torch.maximum(self.action_range[1], action.amax(0)),
             )
             self.checksum = zlib.crc32(part.numpy().data, self.checksum)
+            is_discrete = is_discrete and is_one_hot(action)
             if self.block is not None:
                 self.block[first : first + len(part)] = part
+        if is_discrete:
+            raise ValueError(
+                f"{model.action_key!r} is one-hot in all rows, but world models read "
+                "continuous actions: for discrete ones use MotionInfluence or "
+                "ResidualInfluence"
+            )
         if self.block is not None:
             self.block = self.block.to(self.device)
 
@@ -79,16 +87,17 @@ class FitRows:
                 )
                 state = model.layout.read(part)
                 after = model.layout.read(part, next=True)
-                for what, x, size in (
-                    ("the entities' features", state, model.state_dim),
-                    ("the entities' next features", after, model.state_dim),
-                    (f"{model.action_key!r}", action, model.action_dim),
+                own = "give the data that the model's layout describes"
+                vectors = "store them as [T, A], or correct the model's action_dim"
+                for what, x, size, remedy in (
+                    ("the entities' features", state, model.state_dim, own),
+                    ("the entities' next features", after, model.state_dim, own),
+                    (f"{model.action_key!r}", action, model.action_dim, vectors),
                 ):
                     if tuple(x.shape) != (len(part), size):
                         raise ValueError(
                             f"the shape of {what} is {list(x.shape)}, expected "
-                            f"{[len(part), size]}: give the data that the model's "
-                            "layout describes"
+                            f"{[len(part), size]}: {remedy}"
                         )
                 model.check_finite(state, first_row=first)
                 model.check_finite(after, next=True, first_row=first)

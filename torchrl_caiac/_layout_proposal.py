@@ -52,7 +52,8 @@ def propose_layout(
     goals = {} if is_nested else _goals(data, rows, groups, observation[rows], notes)
     positions = {group.name: group.positions for group in groups if group.positions}
     for name, columns in goals.get("achieved", {}).items():
-        positions.setdefault(name, columns)
+        if columns:
+            positions.setdefault(name, columns)
     unknown = [group.name for group in groups if group.name not in positions]
     if unknown:
         notes.append(
@@ -108,4 +109,9 @@ def _goals(
             "one column of an entity: name goal and achieved in the layout"
         )
         return {}
+    if goal:
+        for group in groups:
+            if not group.is_robot:  # the goal may be that of some objects alone
+                goal.setdefault(group.name, [])
+                equal.setdefault(group.name, ())
     return {"goal": goal, "achieved": equal}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -181,19 +182,22 @@ def fit_world_model(
     low, high = filled_bounds(rows.action_range, bounds, model.action_key)
     generator = torch.Generator().manual_seed(seed)
     key = as_key(trajectory_key)
+    trajectories = trajectory_numbers(sources, key)
     train, validation = split_rows(
-        trajectory_numbers(sources, key),
+        trajectories,
         validation_fraction,
         max_validation_rows,
         generator,
     )
+    if not model.has_floor:
+        model.fit_variance_floor(sources)
     if check:
         _check(model, sources, key)
     fit = _Fit(model, lr, generator)
     settings: dict[str, Any] = {
         "model": model.config,
         "data_rows": rows.lengths,
-        "data_checksum": rows.checksum,
+        "data_checksum": zlib.crc32(trajectories.numpy().data, rows.checksum),
         "action_bounds": bounds and [bound.tolist() for bound in bounds],
         "batch_size": batch_size,
         "lr": lr,
@@ -223,8 +227,6 @@ def fit_world_model(
     # Ranks agree before they wait for each other's gradients.
     every = {"steps": steps, "checkpoint_every": checkpoint_every}
     ranks.check_same({**settings, **every, "keeps": keeper is not None}, fit.step)
-    if not model.has_floor:
-        model.fit_variance_floor(sources)
     if not model.fitted:
         model.fit_statistics(rows.raw_targets(train))
     model.set_action_bounds(low, high)

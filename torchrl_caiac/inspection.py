@@ -248,7 +248,8 @@ def inspect_dataset(
     length = index.lengths[torch.searchsorted(index.ends, index.position(rows))]
     tenth = (length - 1 - index.remaining(rows)) * _TENTHS // length
     action = get_leaf(data, as_key(action_key), DATA_LACK, "pass action_key")[rows]
-    action = floating(action.flatten(1).as_subclass(torch.Tensor)).double()
+    action = action.as_subclass(torch.Tensor).reshape(len(action), -1)
+    action = floating(action).double()
     parts = [
         MovingColumns(data, key, join(next_key, key), rows, action) for key in keys
     ]

@@ -82,7 +82,8 @@ def resting_noise(
     at rest, a fiftieth of the median change while the entity moves, and the resolution.
     For positions that the layout names, the floor is also at least a twentieth, and the
     tolerance a 500th, of the median change of the fastest entity: next to it, a
-    simulator's jitter is no motion.
+    simulator's jitter is no motion. (A fixed entity with another number of positions
+    than the others, such as joint angles of a robot, is left out.)
 
     Args:
         data (TensorDictBase or ReplayBuffer): transitions, ``[*B]``.
@@ -121,8 +122,9 @@ def resting_noise(
     """
     rows = sample_rows(data, max_rows)
     layout.check(rows, next=True)
-    now = layout.read(rows).double().flatten(0, -2)
-    after = layout.read(rows, next=True).double().flatten(0, -2)
+    stored = layout.read(rows)
+    now = stored.cpu().double().flatten(0, -2)
+    after = layout.read(rows, next=True).cpu().double().flatten(0, -2)
     change = (after - now).abs()
     if not bool(change.isfinite().all()):
         bad = [
@@ -134,15 +136,30 @@ def resting_noise(
             f"the states or next states of {bad} have NaN or infinite values: remove "
             "or repair these rows"
         )
-    # Rounding of the stored numbers, which are mostly float32.
-    rounding = torch.finfo(torch.float32).eps * torch.maximum(
-        now.abs().amax(0), after.abs().amax(0)
-    )
+    rounding = _rounding(stored.dtype, torch.cat([now, after]))
     result = {}
     for name, where in layout.slices(rows).items():
         columns = position_features(layout, name, where.stop - where.start)
         result[name] = _entity(change[:, where], rounding[where], columns)
     return _beside_the_fastest(result, layout, layout.slices(rows))
+
+
+def _rounding(dtype: torch.dtype, values: torch.Tensor) -> torch.Tensor:
+    """Returns the rounding of stored numbers ``[n, W]``, ``[W]``.
+
+    Double precision numbers are often made of single precision ones. If not, changes
+    that are tiny next to the range of a column are those of a simulator at rest.
+    """
+    largest = values.abs().amax(0)
+    if not dtype.is_floating_point:
+        return torch.zeros_like(largest)
+    if dtype != torch.float64:
+        return torch.finfo(dtype).eps * largest
+    single = torch.finfo(torch.float32).eps
+    is_single = (values.float().double() == values).all(0)
+    spread = values.amax(0) - values.amin(0)
+    fine = torch.maximum(single * spread, torch.finfo(dtype).eps * largest)
+    return torch.where(is_single, single * largest, fine)
 
 
 def _beside_the_fastest(
@@ -151,17 +168,20 @@ def _beside_the_fastest(
     """Raises floors and tolerances that are tiny next to the motion of other entities.
 
     A simulator's jitter is not the motion of an entity that never really moves. Only
-    positions are compared, which have similar units.
+    positions are compared, which have similar units, and no others with those of a
+    fixed entity that has another number of them, such as joint angles.
     """
     places = {
         name: position_features(layout, name, slices[name].stop - slices[name].start)
         for name in layout.positions
     }
+    sizes = {len(own) for name, own in places.items() if name not in layout.fixed}
     motion = {
         name: max(
             (found[name].moving[c] for c in own if found[name].moving[c] > 0), default=0
         )
         for name, own in places.items()
+        if name not in layout.fixed or not sizes or len(own) in sizes
     }
     fastest = max(motion, key=lambda name: motion[name], default="")
     for name, own in places.items():

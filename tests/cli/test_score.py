@@ -167,6 +167,14 @@ def test_a_killed_call_resumes(caiac: Caiac, pushes: Path) -> None:
         (["--more-data", "pushes"], "--more-data is an option of --estimator"),
         (["--distance", "1"], "--distance is an option of --estimator distance"),
         (["--estimator", "distance"], "needs --distance"),
+        (
+            ["--estimator", "cai", "--world-model", "x", "--seed", "1"],
+            "--seed is for the fit of a world model",
+        ),
+        (
+            ["--estimator", "cai", "--num-actions", "1"],
+            "--num-actions is 1, expected at least 2",
+        ),
         (["--lookahead", "-1"], "--lookahead must be at least 0"),
         (["--smoothing", "0"], "--smoothing must be at least 1"),
         (["--option", "x"], "expected NAME=VALUE"),

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 
+from tests.influence.scoring import ready
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence import AttentionInfluence, score_buffer
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
@@ -23,7 +24,7 @@ N = 3
 def make(**kwargs: Any) -> TransformerWorldModel:
     torch.manual_seed(0)
     settings: dict[str, Any] = {"layers": 3, "heads": 2, "width": 8, **kwargs}
-    return TransformerWorldModel(LAYOUT, 2, **settings)
+    return ready(TransformerWorldModel(LAYOUT, 2, **settings))
 
 
 def transitions(*batch: int, seed: int = 0) -> TensorDict:
@@ -50,7 +51,7 @@ class Known(TransformerWorldModel):
 
 
 def known(*layers: torch.Tensor) -> AttentionInfluence:
-    model = Known(LAYOUT, 2, 1, 1, 4)
+    model = ready(Known(LAYOUT, 2, 1, 1, 4))
     model.known = torch.stack(layers)
     return AttentionInfluence(model)
 
@@ -174,6 +175,8 @@ def test_rejects_models_without_attention() -> None:
         AttentionInfluence(make(predict={"cup": ()}))
     with pytest.raises(ValueError, match="max_memory"):
         AttentionInfluence(make(), max_memory=0)
+    with pytest.raises(ValueError, match="the model was never fitted"):
+        AttentionInfluence(TransformerWorldModel(LAYOUT, 2, 1, 1, 4))
 
 
 def test_rejects_input_that_is_not_finite() -> None:

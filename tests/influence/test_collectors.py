@@ -120,13 +120,12 @@ def test_rows_are_scored_as_they_are_written(kind, storage):
     assert len(rb) == 150
     assert_scores_of_their_states(rb)
 
-    class Never(DistanceInfluence):
-        def forward(self, tensordict):
-            raise AssertionError("nothing is left to score")
+    def never(self, tensordict):
+        raise AssertionError("nothing is left to score")
 
-    never = distances()
-    never.forward = Never.forward.__get__(never)
-    score_buffer(rb, never, progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DistanceInfluence, "forward", never)
+        score_buffer(rb, distances(), progress=False)
 
 
 def test_batches_of_a_collector_may_be_extended_by_hand():

@@ -12,9 +12,17 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from tests.influence.scoring import LAYOUT, episodes
-from torchrl_caiac.influence import score_buffer
+from tests.influence.scoring import LAYOUT, episodes, ready
+from torchrl_caiac.influence import (
+    CAI,
+    AttentionInfluence,
+    DistanceInfluence,
+    MotionInfluence,
+    ResidualInfluence,
+    score_buffer,
+)
 from torchrl_caiac.influence.estimator_digest import DigestCache, estimator_digest
+from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
 
 
 class Plain:
@@ -278,3 +286,45 @@ def test_a_model_that_was_trained_further_has_other_scores():
     score_buffer(rb, Plain(1.0), progress=False)
     with pytest.raises(ValueError, match="have other settings: estimator was"):
         score_buffer(rb, Plain(3.0), progress=False)
+
+
+def test_functions_of_described_objects_change_the_digest():
+    class Described:
+        def __init__(self, make):
+            self.make = make
+
+        def __repr__(self):
+            return "Described"
+
+    one, other = (lambda: 1), (lambda: 2)
+    assert estimator_digest(Described(one)) != estimator_digest(Described(other))
+    assert estimator_digest(Described(one)) == estimator_digest(Described(one))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda data: MotionInfluence(LAYOUT).fit(data),
+        lambda data: ResidualInfluence(LAYOUT).fit(data, steps=2, progress=False),
+        lambda data: DistanceInfluence(
+            LAYOUT, {name: [own[0]] for name, own in LAYOUT.columns.items()}, "arm"
+        ),
+        lambda data: CAI(ready(GaussianWorldModel(LAYOUT, 2, (8,)))),
+        lambda data: AttentionInfluence(
+            ready(TransformerWorldModel(LAYOUT, 2, 1, 1, 4))
+        ),
+    ],
+    ids=["motion", "residual", "distance", "cai", "attention"],
+)
+def test_scoring_does_not_change_the_digest(make):
+    """So that what was added later is scored by the same estimator."""
+    rows = episodes([30, 30])
+    rb = ReplayBuffer(storage=LazyTensorStorage(200), batch_size=8)
+    rb.extend(rows)
+    estimator = make(rb)
+    before = estimator_digest(estimator)
+    score_buffer(rb, estimator, progress=False)
+    assert estimator_digest(estimator) == before
+    rows["episode"] += 10
+    rb.extend(rows)
+    score_buffer(rb, estimator, progress=False)

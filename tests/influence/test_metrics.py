@@ -99,3 +99,10 @@ class TestMetrics:
             best_threshold([], np.zeros(0, dtype=bool))
         with pytest.raises(ValueError, match=r"\[S, 2\]"):
             influence_report(np.zeros((2, 3)), np.zeros((2, 3), bool), ["a", "b"], 0.3)
+
+
+@pytest.mark.gpu
+def test_scores_on_a_gpu() -> None:
+    scores, truth = torch.tensor([[0.9], [0.1]]), torch.tensor([[True], [False]])
+    on_cpu = influence_report(scores, truth, ["cup"], 0.5)
+    assert influence_report(scores.cuda(), truth.cuda(), ["cup"], 0.5) == on_cpu

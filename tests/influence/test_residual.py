@@ -159,3 +159,14 @@ def test_what_cannot_be_fitted_is_refused() -> None:
     data["observation"][3, 2] = math.nan
     with pytest.raises(ValueError, match=r"\['ball'\] have NaN or infinite"):
         ResidualInfluence(LAYOUT, TOLERANCE).fit(data, steps=500, progress=False)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", [MotionInfluence, ResidualInfluence])
+def test_fits_data_on_a_gpu(kind: type) -> None:
+    td, _ = rolling(500)
+    options = {"steps": 3, "progress": False} if kind is ResidualInfluence else {}
+    on_cpu = kind(LAYOUT).fit(td, **options)
+    on_gpu = kind(LAYOUT).fit(td.to("cuda"), **options)
+    assert on_gpu.tolerance == on_cpu.tolerance
+    torch.testing.assert_close(on_gpu(td.to("cuda")).cpu(), on_cpu(td))

@@ -140,7 +140,8 @@ def model_cai(**kwargs):
 
 
 def attention(**kwargs):
-    return AttentionInfluence(TransformerWorldModel(LAYOUT, 2, 2, 2, 8), **kwargs)
+    model = ready(TransformerWorldModel(LAYOUT, 2, 2, 2, 8))
+    return AttentionInfluence(model, **kwargs)
 
 
 @pytest.mark.gpu

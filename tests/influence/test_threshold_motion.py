@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given
@@ -157,3 +159,12 @@ def test_no_positions_say_nothing() -> None:
     td = data([[0.0, 0.0]], [1])
     sampled = sample_blocks(td, 1, lookahead=0, max_rows=9, **KEYS)
     assert motion_of_rows(td, layout, sampled, position_tolerances(td, layout)) == {}
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "message"),
+    [(0, "'cup' is 0, expected"), ({"pan": 1.0}, "pan"), (float("nan"), "is nan")],
+)
+def test_tolerances_that_are_refused(tolerance: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        position_tolerances(TensorDict(), LAYOUT, tolerance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -11,6 +12,7 @@ from tensordict import TensorDict
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence import CAI
 from torchrl_caiac.modules import GaussianWorldModel, TransformerWorldModel
+from torchrl_caiac.modules._variance_floor import checked_floor
 from torchrl_caiac.noise import resting_noise
 
 LAYOUT = EntityLayout({"arm": [3, 0, 1], "cup": [2, 4]})
@@ -129,3 +131,10 @@ def test_an_unknown_floor_is_refused() -> None:
 def test_other_texts_are_refused(floor: Any) -> None:
     with pytest.raises(ValueError, match=r"of entity 'arm' is .*or 'auto' for all"):
         GaussianWorldModel(LAYOUT, 2, variance_floor=floor)
+
+
+def test_floors_of_numpy_and_torch() -> None:
+    predict = {"arm": (0, 1), "cup": (0,)}
+    given = {"arm": np.array([0.5, 0.25]), "cup": torch.tensor([2.0])}
+    assert checked_floor(given, predict) == [0.5, 0.25, 2.0]
+    assert checked_floor(np.float32(0.5), predict) == [0.5] * 3

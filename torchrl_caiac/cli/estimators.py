@@ -264,6 +264,26 @@ def estimator_settings(
             f"--{option.replace('_', '-')} is an option of --estimator "
             f"{' and '.join(users)}, not of {name}: leave it out"
         )
+    if args.world_model is not None:
+        unused = [o for o in ("steps", "seed") if getattr(args, o) is not None]
+        unused += ["more_data"] * bool(args.more_data)
+        if unused:
+            raise UsageError(
+                f"--{unused[0].replace('_', '-')} is for the fit of a world model, but "
+                "--world-model has one that is fitted: leave one of them out"
+            )
+    if args.num_actions == 1:
+        raise UsageError("--num-actions is 1, expected at least 2, to compare them")
+    if set(layout.fixed) == set(layout.names):
+        raise UsageError(
+            f"all entities of the layout are fixed, {list(layout.names)}, so that "
+            "nothing is swapped: remove the objects from fixed"
+        )
+    if args.far is not None and len(layout.fixed) != 1:
+        raise UsageError(
+            "--far needs a layout with one fixed entity, the robot, but it has "
+            f"{list(layout.fixed)}: describe the robot as one entity, or leave it out"
+        )
     settings = {
         option: default if getattr(args, option) is None else getattr(args, option)
         for option, default in entry.options.items()
@@ -317,7 +337,7 @@ def _action_dim(data: TensorDictBase) -> int:
     if len(shape) != 1:
         raise ValueError(
             f"'action' has shape {['T', *shape]}, expected [T, A]: a world model reads "
-            "vectors"
+            "vectors. For discrete actions use --estimator motion or residual"
         )
     return int(shape[0])
 

@@ -328,7 +328,7 @@ def _coverage(context: Context) -> dict[str, Any] | None:
     with context.console.step("looking at the actions"):
         try:
             found = action_coverage([context.data, *context.more], context.layout)
-        except ImportError as error:
+        except (ImportError, ValueError) as error:
             context.console.warn(
                 f"whether the data hold different actions is not known: {error}"
             )

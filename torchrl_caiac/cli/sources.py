@@ -99,8 +99,8 @@ def add_data(parser: argparse.ArgumentParser, *, cache: bool = True) -> None:
         group.add_argument(
             "--cache",
             metavar="DIR",
-            help="where converted data are kept; default: torchrl_caiac in "
-            "$XDG_CACHE_HOME or ~/.cache",
+            help="where converted data are kept, in `caiac score` those of "
+            "--more-data; default: torchrl_caiac in $XDG_CACHE_HOME or ~/.cache",
         )
 
 

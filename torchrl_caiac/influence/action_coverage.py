@@ -257,6 +257,7 @@ def _read(
         action = get_leaf(
             part, action_key, "the data lack the action", "name it: action_key=..."
         )
+        action = action.reshape(len(action), -1)
         state = layout.read(part)
         for what, x in (("the state", state), (f"{action_key!r}", action)):
             if not bool(x.isfinite().all()):

@@ -42,7 +42,7 @@ class AttentionInfluence(nn.Module):
 
     Raises:
         TypeError: the model has no attention.
-        ValueError: the model does not predict an entity.
+        ValueError: the model does not predict an entity, or was never fitted.
 
     Examples:
         >>> import torch
@@ -52,6 +52,7 @@ class AttentionInfluence(nn.Module):
         >>> from torchrl_caiac.modules import TransformerWorldModel
         >>> layout = EntityLayout({"arm": [0, 1], "cup": [2]})
         >>> model = TransformerWorldModel(layout, 2, layers=2, heads=2, width=8)
+        >>> _ = model.fit_statistics(torch.randn(5, 3))  # by fit_world_model
         >>> td = TensorDict(
         ...     {"observation": torch.randn(5, 3), "action": torch.randn(5, 2)}, [5]
         ... )
@@ -80,6 +81,11 @@ class AttentionInfluence(nn.Module):
             raise ValueError(
                 f"the model predicts no column of {missing}: every entity needs a "
                 "score, predict at least one column of each"
+            )
+        if not model.fitted:
+            raise ValueError(
+                "the model was never fitted, so that its scores would mean nothing: "
+                "call fit_world_model(model, data), or load a fitted one, first"
             )
         if max_memory < 1:
             raise ValueError(

@@ -212,7 +212,9 @@ class _Contents:
         """Yields the models and tensors that the ``repr`` leaves out."""
         if isinstance(value, (*_PLAIN, type, types.ModuleType, EntityLayout)):
             return
-        if isinstance(value, _MODELS) or _is_tensordict(value):
+        if isinstance(value, types.FunctionType) or (
+            isinstance(value, _MODELS) or _is_tensordict(value)
+        ):
             found = self.digest(value)
             if found != b"itself":
                 yield found
@@ -222,9 +224,6 @@ class _Contents:
                 inside = [value.__func__, value.__self__]
             elif isinstance(value, functools.partial):
                 inside = [value.func, value.args, value.keywords]
-            elif isinstance(value, types.FunctionType):
-                cells = [cell.cell_contents for cell in value.__closure__ or ()]
-                inside = [cells, value.__defaults__, value.__kwdefaults__, vars(value)]
             for label, item in self._items(inside):
                 found = self.digest(item, models=True)
                 if found:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+import torch
 
 if TYPE_CHECKING:
     import torch
@@ -149,7 +150,7 @@ def influence_report(
         >>> report["kettle"]["auc"], report["microwave"]["below_threshold"]
         (1.0, 1.0)
     """
-    values, mask = np.asarray(scores, dtype=np.float64), np.asarray(truth)
+    values, mask = _array(scores).astype(np.float64), _array(truth)
     shape = (len(values), len(names))
     if values.shape != shape or mask.shape != shape:
         raise ValueError(
@@ -179,9 +180,13 @@ def influence_report(
     return report
 
 
+def _array(values: Any) -> NDArray[Any]:
+    is_tensor = isinstance(values, torch.Tensor)
+    return np.asarray(values.detach().cpu() if is_tensor else values)
+
+
 def _checked(score: Any, truth: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    values = np.asarray(score, dtype=np.float64)
-    mask = np.asarray(truth)
+    values, mask = _array(score).astype(np.float64), _array(truth)
     if values.ndim != 1 or mask.shape != values.shape:
         raise ValueError(
             f"score and truth have the shapes {values.shape} and {mask.shape}, "

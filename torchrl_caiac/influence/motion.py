@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -105,6 +105,10 @@ class MotionInfluence(nn.Module):
             )
         # For each device and width of the state: the output of `columns`.
         self._limits: dict[tuple[torch.device, int], list[torch.Tensor]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the settings without the cache, which the digest must not have."""
+        return {**self.__dict__, "_limits": {}}
 
     @property
     def in_keys(self) -> list[NestedKey]:

@@ -15,6 +15,7 @@ from torchrl.modules import MLP
 from tqdm.auto import tqdm
 from typing_extensions import Self
 
+from torchrl_caiac._keys import floating
 from torchrl_caiac._layout_units import position_features
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.distance import checked_agent
@@ -198,8 +199,12 @@ class ResidualInfluence(MotionInfluence):
         # Scores the rows as motion, which also checks that they are finite.
         self.entities = None
         moved = self._motion(rows)
-        state = self.layout.read(rows).float().flatten(0, -2)
-        after = self.layout.read(rows, next=True).float().flatten(0, -2)
+        stored = self.layout.read(rows)
+        state = stored.cpu().flatten(0, -2)
+        after = self.layout.read(rows, next=True).cpu().flatten(0, -2)
+        # Before they become float32, so that small changes far from zero are kept.
+        changes = (floating(after) - floating(state)).float()
+        state = state.float()
         index, limit, owner = self.columns(state, rows)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -217,7 +222,7 @@ class ResidualInfluence(MotionInfluence):
                     int(own.sum()),
                     self.hidden_sizes,
                 )
-                change = (after - state)[:, index[own]]
+                change = changes[:, index[own]]
                 use = self._usable(state, name, rows)
                 _fit(
                     entity,
@@ -229,7 +234,7 @@ class ResidualInfluence(MotionInfluence):
                     lr=lr,
                 )
                 entities.append(entity)
-        self.entities = entities.eval().requires_grad_(False)
+        self.entities = entities.to(stored.device).eval().requires_grad_(False)
         self._log_explained(moved > 0, self(rows).flatten(0, -2) > 0)
         return self
 

@@ -45,8 +45,8 @@ class RowStates(NamedTuple):
 
     Attributes:
         valid (torch.Tensor): bool ``[T]``, which rows have a score of their state.
-        moved (torch.Tensor): bool ``[T]``, which of them had other rows around them in
-            their trajectory when they were scored.
+        moved (torch.Tensor): bool ``[T]``, which of them had other neighbours in their
+            trajectory when they were scored.
         has_others (bool): whether a row has a score of its state with other settings.
     """
 

@@ -326,8 +326,8 @@ class ScoreParts:
 
         Args:
             plan (Plan): the plan.
-            first (int): the range to take if it is free. If it is not, the middle of
-                the most that are free in succession.
+            first (int): the range to take if it is free; otherwise it is the middle of
+                the longest run of free ranges.
 
         Returns:
             int, optional: the range; ``None`` if all are claimed.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_caiac._columns import check_names
 from torchrl_caiac._layout_units import position_places
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.threshold_rule import MOVES, RESTS
@@ -116,6 +118,9 @@ def position_tolerances(
         dict of str to torch.Tensor: float64, for each entity with positions one number
         for each of them.
 
+    Raises:
+        ValueError: a tolerance is not positive, or that of no entity.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl_caiac import EntityLayout
@@ -129,6 +134,13 @@ def position_tolerances(
     names = list(layout.positions)
     if given is not None:
         numbers = given if isinstance(given, Mapping) else dict.fromkeys(names, given)
+        check_names(numbers, layout.names, "tolerance")
+        for name, number in numbers.items():
+            if not 0 < number < math.inf:
+                raise ValueError(
+                    f"tolerance of entity {name!r} is {number!r}, expected a number in "
+                    "the units of the data, positive and finite"
+                )
         return {
             name: torch.full(
                 (len(layout.positions[name]),), float(numbers[name])
@@ -258,7 +270,7 @@ def without_near_rests(motion: torch.Tensor) -> torch.Tensor:
 
     Returns:
         torch.Tensor: int8 ``[K, B]``. Rows at rest up to three rows from one that does
-        not rest are neither; all are kept if only less than half of them are left.
+        not rest are neither; if fewer than half would be left, all are kept.
 
     Examples:
         >>> import torch

@@ -68,8 +68,8 @@ class ThresholdSuggestions:
     Args:
         thresholds (dict of str to float): for ``CAIACTransform(threshold=...)``. Below
             all scores where nothing of the entity may be swapped: if it is always
-            influenced, or if no clear threshold was found. Twice the highest score if
-            it is never influenced.
+            influenced, or if no clear threshold was found. If it is never influenced:
+            twice the highest score that was looked at, or 0.05 if no score is above 0.
         confidence (dict of str to str): ``"two clear modes"``; ``"one mode: never
             influenced"``, so that all rows are free; ``"one mode: always influenced"``
             or ``"unclear"``, so that none is.
@@ -78,7 +78,7 @@ class ThresholdSuggestions:
             free to be swapped with this threshold.
         splits (dict of str to float): the best split of the scores, also where it is
             not clear; without entities whose scores are all equal or at most 0.
-        rows (int): the number of rows that the splits are from.
+        rows (int): the number of rows from which the splits were computed.
     """
 
     thresholds: dict[str, float]
@@ -285,7 +285,9 @@ def suggest_thresholds(
     length = len(storage)
     names = [name for name in layout.names if name not in layout.fixed]
     if not names:
-        raise ValueError("all entities of the layout are fixed: none has a threshold")
+        raise ValueError(
+            "all entities of the layout are fixed: none is swapped, or has a threshold"
+        )
     scores = _scores(data, score_key, layout, length)
     record = read_record(storage, data, score_key)
     settings = {} if record is None else record["settings"]

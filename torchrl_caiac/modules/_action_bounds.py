@@ -18,11 +18,12 @@ __all__ = [
     "check_actions",
     "differing_bounds",
     "filled_bounds",
+    "is_one_hot",
     "known_bounds",
     "spec_bounds",
 ]
 
-_OUTSIDE = 1e-4  # of the range: what rounding may add
+_OUTSIDE = 1e-3  # of the range: what rounding and normalisation may add
 _NARROW = 0.05  # of the range: actions in less have not shown what the others do
 _WIDER = 1.5  # factor between widths that are taken for the same
 
@@ -50,7 +51,8 @@ def spec_bounds(spec: Any, size: int) -> tuple[torch.Tensor, torch.Tensor]:
     if not isinstance(spec, Bounded):
         raise TypeError(
             f"action_spec must be a torchrl Bounded spec, got {type(spec).__name__}: "
-            "only a bounded action space has a uniform distribution"
+            "world models read continuous actions. For discrete ones use "
+            "MotionInfluence or ResidualInfluence"
         )
     if tuple(spec.shape) != (size,):
         raise ValueError(
@@ -88,7 +90,7 @@ def check_actions(
 
     Keyword Args:
         tolerance (float): the tolerated excess, as a share of the width.
-            Defaults to ``1e-4``.
+            Defaults to ``1e-3``.
         first_row (int): the number of the first row. Defaults to ``0``.
         remedy (str): the end of the message, which says what to do.
 
@@ -119,6 +121,24 @@ def check_actions(
         f"{high[column].item():g}] ({count} such row{'s' if count > 1 else ''} of "
         f"{len(rows)}): {remedy}"
     )
+
+
+def is_one_hot(action: torch.Tensor) -> bool:
+    """Returns whether actions are discrete ones, of which each row has one.
+
+    Args:
+        action (torch.Tensor): ``[T, A]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.modules._action_bounds import is_one_hot
+        >>> is_one_hot(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
+        True
+        >>> is_one_hot(torch.tensor([[0.0, 1.0], [0.5, 0.5]]))
+        False
+    """
+    is_binary = ((action == 0) | (action == 1)).all()
+    return action.shape[-1] > 1 and bool(is_binary and (action.sum(-1) == 1).all())
 
 
 def known_bounds(
@@ -189,8 +209,8 @@ def filled_bounds(
     if known is None:
         warnings.warn(
             f"the action space is not known: {key!r} is taken to be in the range of "
-            f"the data, {bounds_text(seen)}. Pass action_spec if other actions are "
-            "possible",
+            f"the data, {bounds_text(seen)}. If other actions are possible, pass "
+            "action_spec, or store the bounds with the data (action_bounds=)",
             stacklevel=3,
         )
     low, high = seen if known is None else known
@@ -250,7 +270,7 @@ def differing_bounds(
     """
     (low, high), (known_low, known_high) = given, known
     width, known_width = high - low, known_high - known_low
-    margin = 10 * _OUTSIDE * known_width + 1e-6 * torch.maximum(
+    margin = _OUTSIDE * known_width + 1e-6 * torch.maximum(
         known_low.abs(), known_high.abs()
     )
     differ = (low < known_low - margin) | (high > known_high + margin)

@@ -191,6 +191,8 @@ def checked_floor(
     floors: list[float] = []
     for name, value in per_entity.items():
         count = len(predict[name])
+        # NumPy's numbers and arrays, and tensors, become Python's.
+        value = value.tolist() if hasattr(value, "tolist") else value
         values = list(value) if isinstance(value, Sequence) else [value] * count
         if len(values) != count or not all(map(_is_deviation, values)):
             raise ValueError(
