@@ -188,3 +188,22 @@ def half_a_folder(path: Path, leave: bool = False) -> None:
         if not leave:
             yield
     yield
+
+
+def test_an_interrupt_between_the_moves_keeps_the_old_folder(tmp_path, monkeypatch):
+    path = tmp_path / "data"
+    path.mkdir()
+    (path / "old").touch()
+    replace, moves = os.replace, []
+
+    def interrupted(source, target):
+        moves.append(target)
+        if len(moves) == 2:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt), whole_folder(path) as partial:
+        partial.mkdir()
+    assert [x.name for x in path.iterdir()] == ["old"]
+    assert [x.name for x in tmp_path.iterdir()] == ["data"]

@@ -107,16 +107,12 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         made, replaced = partial / path.name, partial / f"{_REPLACED}{path.name}"
         try:
             yield made
-            was_there = path.exists()
-            if was_there:
+            if path.exists():
                 os.replace(path, replaced)
-            try:
-                os.replace(made, path)
-            except OSError:
-                if was_there:
-                    os.replace(replaced, path)
-                raise
+            os.replace(made, path)
         finally:
+            if replaced.exists() and not path.exists():  # interrupted in between
+                os.replace(replaced, path)
             shutil.rmtree(partial, ignore_errors=True)
 
 

@@ -102,7 +102,8 @@ class TrajectoryTail(NamedTuple):
         ends (torch.Tensor): int64 ``[E]``, as in
             :class:`~torchrl_caiac.trajectories.TrajectoryIndex`.
         start (int): the position of the first row of the first trajectory that was
-            written to. What precedes it has lost its oldest rows, and nothing else.
+            written to. Earlier trajectories are as before, except that the oldest rows
+            may be gone.
     """
 
     length: int

@@ -164,3 +164,27 @@ def test_brain_floats_are_written_as_floats(tmp_path: Path) -> None:
     rows = TensorDict({"observation": torch.ones(3, 2, dtype=torch.bfloat16)}, [3])
     arrays, _ = read_npz(export_npz(rows, tmp_path / "a.npz"))
     assert arrays["observations"].dtype == np.float32
+
+
+def test_what_is_no_state_is_left_out(tmp_path: Path) -> None:
+    """Such as the source of a mixture, and a success in the next state."""
+    data = TensorDict(
+        {
+            "observation": torch.rand(4, 2),
+            "action": torch.rand(4, 1),
+            "episode": torch.zeros(4, dtype=torch.int64),
+            "source": torch.zeros(4, dtype=torch.int64),
+            "next": {
+                "observation": torch.rand(4, 2),
+                "success": torch.zeros(4, 1, dtype=torch.bool),
+                "done": torch.tensor([[False]] * 3 + [[True]]),
+                "terminated": torch.zeros(4, 1, dtype=torch.bool),
+            },
+        },
+        [4],
+    )
+    export_npz(data, tmp_path / "a.npz")
+    names = {"observations", "next_observations", "actions", "episodes"}
+    assert {*np.load(tmp_path / "a.npz")} == names | {"dones", "terminals"}
+    back = open_dataset(tmp_path / "a.npz", tmp_path / "back", progress=False)
+    assert back["observation"].shape[-1] == 2

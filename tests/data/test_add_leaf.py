@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.killing import run_killed
 from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import (
     add_leaf,
@@ -163,3 +167,15 @@ class TestUnlocked:
         data["name"] = "cup"
         with pytest.raises(ValueError, match="'name' of the data opened from"):
             offline_buffer(data)
+
+
+def test_a_killed_process_adds_a_leaf_as_a_whole_or_not(data, tmp_path):
+    def killed():
+        torch.Tensor.copy_ = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
+        add_leaf(data, "weight", np.ones(6))
+        yield
+
+    run_killed(killed)
+    again = load_transitions(tmp_path / "rows", verify=True)
+    assert "weight" not in again
+    assert add_leaf(again, "weight", np.ones(6)).tolist() == [1.0] * 6

@@ -613,7 +613,7 @@ class TestRefused:
                 {},
                 "episode 1 has one observation and one",
             ),
-            ([OBS], [ACT], {"terminals": [flags(3)]}, "contradict each other at row 3"),
+            ([OBS], [ACT], {"terminals": [flags(3)]}, "episode 0 is set in row 3"),
             ({"a": [OBS], "b": OBS}, [ACT], {}, "'a': 1, 'b': None"),
             ([OBS, OBS.astype(int)], [ACT, ACT], {}, "float32.*int64|int64.*float32"),
         ],

@@ -163,3 +163,10 @@ def test_without_h5py_the_package_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"package h5py"):
         load(file)
+
+
+def test_an_array_beside_a_group_of_its_name(tmp_path):
+    names = {"observations": np.zeros((4, 2)), "observations/cup": np.zeros((4, 1))}
+    np.savez(tmp_path / "a.npz", actions=np.zeros((4, 1)), **names)
+    with pytest.raises(ValueError, match="has the array 'observations' and arrays"):
+        load_array_file(tmp_path / "a.npz", tmp_path / "data", progress=False)

@@ -352,3 +352,11 @@ def test_cameras_are_left_out_and_said(folder, caplog):
     edit_info(folder, features=info["features"])
     with pytest.raises(UnreadableFileError, match=r"info.json has unreadable features"):
         load(folder, overwrite=True)
+
+
+def test_other_roles_of_the_same_features_are_other_data(folder, tmp_path):
+    path = tmp_path / "roles"
+    first = load_lerobot(folder, path, progress=False)
+    assert ("info", "action") not in first.keys(True, True)
+    with pytest.raises(FileExistsError):
+        load_lerobot(folder, path, infos=["action"], progress=False)

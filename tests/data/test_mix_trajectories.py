@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import NonTensorData, TensorDict
 
+from torchrl_caiac import EntityLayout
 from torchrl_caiac.data import (
     action_bounds,
     from_arrays,
@@ -21,6 +22,7 @@ from torchrl_caiac.data import (
 )
 from torchrl_caiac.data.digests import data_digest, data_source
 from torchrl_caiac.data.write_transitions import write_transitions
+from torchrl_caiac.influence import score_buffer
 
 
 def source(lengths, *, first_id=0, id_shape=(), seed=0):
@@ -422,3 +424,29 @@ class TestSourcesOfDifferentLoaders:
             expected = ids.reshape(-1).long()
             assert own["source_episode"].sort()[0].tolist() == expected.tolist()
         assert mixed["episode"].unique_consecutive().tolist() == [0, 1, 2, 3]
+
+
+def test_scores_of_other_estimators_are_refused():
+    class Scaled:
+        layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
+
+        def __init__(self, scale):
+            self.scale = scale
+
+        def __call__(self, td):
+            return self.scale * td["observation"].abs()
+
+    def scored(scale, seed):
+        data = source([20, 30], seed=seed)
+        data["observation"] = data["observation", "arm"][:, :2].clone()
+        data["next", "observation"] = data["observation"] + 1
+        rb = offline_buffer(data, batch_size=8)
+        score_buffer(rb, Scaled(scale), check=False, progress=False)
+        return rb.storage[:]
+
+    one, same, other = scored(1.0, 0), scored(1.0, 1), scored(100.0, 2)
+    mixed = mix_trajectories([one, same], shares=[0.5, 0.5])
+    assert ("caiac", "score") in mixed.keys(True, True)
+    with pytest.raises(ValueError, match=r"0 and source 1 .*exclude=\['caiac'\]"):
+        mix_trajectories([one, other], shares=[0.5, 0.5])
+    mix_trajectories([one, other], shares=[0.5, 0.5], exclude=["caiac"])

@@ -141,3 +141,14 @@ def test_what_is_not_a_tensor_is_refused_before_it_is_written(tmp_path):
     with pytest.raises(ValueError, match=r"'note'\) .* is a NonTensorData.*exclude"):
         write_transitions(data, tmp_path / "data")
     assert not list(tmp_path.iterdir())
+
+
+def test_what_another_process_wrote_meanwhile_stays(tmp_path):
+    rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+    with (
+        pytest.raises(FileExistsError, match="exists: open it"),
+        whole_transitions(tmp_path / "a", keys=["action"], overwrite=False) as folder,
+    ):
+        rows.memmap(folder)
+        (rows + 1).memmap(tmp_path / "a")
+    assert load_transitions(tmp_path / "a", keys=["action"])["action"].eq(1).all()

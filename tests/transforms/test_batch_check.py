@@ -334,6 +334,9 @@ def test_infinite_scores_are_not_kept(infinity: float) -> None:
     td[KEY][4, 2] = infinity
     with pytest.raises(ValueError, match=r"is infinite for \['box'\]"):
         CAIACTransform(FLAT, unscored="keep")(td)
+    td[KEY][3, 1] = math.nan  # which is kept
+    with pytest.raises(ValueError, match=r"is infinite for \['box'\]"):
+        CAIACTransform(FLAT, unscored="keep")(td)
 
 
 @pytest.mark.usefixtures("late")

@@ -470,3 +470,37 @@ def test_donors_that_another_process_overwrites_do_not_donate(window, tmp_path):
         assert (out["observation"] >= 0).all()
     assert transform.no_donor_count[1] > 0
     assert out["caiac", "swapped"][:, 1].all()  # the index was built again
+
+
+def test_donors_of_another_estimator_are_refused() -> None:
+    layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
+
+    class Scaled:
+        def __init__(self, scale: float) -> None:
+            self.layout, self.scale = layout, scale
+
+        def __call__(self, td: TensorDict) -> torch.Tensor:
+            return self.scale * td["observation"].abs()
+
+    def scored(scale: float) -> ReplayBuffer:
+        state = torch.rand(40, 2)
+        data = TensorDict(
+            {
+                "observation": state,
+                "episode": torch.zeros(40, dtype=torch.int64),
+                "next": {"observation": state, "done": torch.zeros(40, 1).bool()},
+            },
+            [40],
+        )
+        rb = ReplayBuffer(storage=LazyTensorStorage(40), batch_size=8)
+        rb.extend(data)
+        score_buffer(rb, Scaled(scale), check=False, progress=False)
+        return rb
+
+    rb = scored(1.0)
+    rb.append_transform(CAIACTransform(layout, 0.5, donors=scored(1.0)))
+    rb.sample()
+    rb = scored(1.0)
+    rb.append_transform(CAIACTransform(layout, 0.5, donors=scored(50.0)))
+    with pytest.raises(ValueError, match="donors was computed by another estimator"):
+        rb.sample()

@@ -134,7 +134,7 @@ def augment_dataset(
     _check_space(path, first, before + rows, ratio)
     episode = _first_id(scored.data["episode"], number) if originals else 0
     bounds = action_bounds(scored.data)
-    with whole_transitions(path) as folder:
+    with whole_transitions(path, overwrite=overwrite) as folder:
         stored = first.expand(before + rows).memmap_like(folder)
         reserve(folder)
         _copy(data[:before], stored, scored)
@@ -308,10 +308,14 @@ def _single_steps(parts: Iterator[TensorDictBase]) -> Iterator[TensorDictBase]:
     """Makes each row an episode of one step."""
     for part in parts:
         after = part["next"]
-        done = torch.ones_like(after["done"])
-        if after.get("terminated", None) is not None:
-            after["truncated"] = done & ~after["terminated"]
-        after["done"] = done
+        after["done"] = torch.ones_like(after["done"])
+        terminated, truncated = (
+            after.get(f"{n}ated", None) for n in ("termin", "trunc")
+        )
+        if terminated is not None:
+            after["truncated"] = (terminated == 0).to(terminated.dtype)
+        elif truncated is not None:
+            after["truncated"] = torch.ones_like(truncated)
         yield part
 
 

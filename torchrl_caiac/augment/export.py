@@ -163,6 +163,11 @@ def export_hdf5(
 def _arrays(data: TensorDictBase) -> Iterator[tuple[str, torch.Tensor]]:
     """Yields the names and tensors of the entries that have a name there."""
     keys = sorted((path_of(key) for key in data.keys(True, True)), key=str)
+    after = {key[1:] for key in keys if key[0] == "next"}
+    # A vector that has no next one is a goal, a number tells something else of a row.
+    root = {key for key in keys if key[0] != "next"}
+    root = {key for key in root if key in after or data.get(key).ndim > 1}
+    keys = [key for key in keys if key in _NAMES or _state(key) in root]
     states = [key for key in keys if _state(key) is not None]
     is_vector = all(_state(key) == ("observation",) for key in states)
     for key in keys:

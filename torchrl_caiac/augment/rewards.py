@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._keys import get_leaf
+from torchrl_caiac._keys import floating, get_leaf
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.transforms.rewards import goal_vectors
 
@@ -79,7 +79,7 @@ class SparseReward:
         self, next_achieved: torch.Tensor, desired: torch.Tensor
     ) -> torch.Tensor:
         """Returns the largest distance of a group from its goal, ``[C]``."""
-        gap = next_achieved - desired
+        gap = floating(next_achieved) - floating(desired)
         parts = [gap[:, list(group)].norm(dim=-1) for group in self.groups]
         return torch.stack(parts, -1).amax(-1)
 

@@ -12,7 +12,13 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import recover_meta, reserve, safe_meta, write_json
+from torchrl_caiac._files import (
+    recover_meta,
+    reserve,
+    safe_meta,
+    whole_file,
+    write_json,
+)
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac._torchrl import (
@@ -100,9 +106,7 @@ def add_leaf(data: TensorDictBase, key: NestedKey, values: Any) -> torch.Tensor:
         with data.unlock_() if data.is_locked else contextlib.nullcontext():
             data.set(key, leaf)
         return data.get(key)
-    stored = new_leaf(data, key, leaf.shape, leaf.dtype)
-    stored.copy_(leaf)
-    return stored
+    return _stored(data, key, leaf)
 
 
 def store_leaves(data: TensorDictBase) -> list[NestedKey]:
@@ -160,7 +164,7 @@ def store_leaves(data: TensorDictBase) -> list[NestedKey]:
     mark_memmap(data)
     try:
         for key, leaf in added:
-            new_leaf(data, key, leaf.shape, leaf.dtype).copy_(leaf)
+            _stored(data, key, leaf)
     except BaseException:
         # A parent may hold the lock; the error that led here is the one to raise.
         with contextlib.suppress(RuntimeError):
@@ -244,6 +248,22 @@ def new_leaf(
                 remove_leaf(data, key)
                 raise
     return leaf
+
+
+def _stored(data: TensorDictBase, key: NestedKey, leaf: torch.Tensor) -> torch.Tensor:
+    """Adds a leaf with its values, which a killed process adds as a whole or not."""
+    folder = memmap_folder(data)
+    if folder is None:
+        return new_leaf(data, key, leaf.shape, leaf.dtype).copy_(leaf)
+    with safe_meta(folder):
+        # A full disk would kill the process while it writes to mapped memory.
+        with whole_file(Path(folder) / "space") as partial:
+            with partial.open("wb") as file:
+                file.truncate(leaf.numel() * leaf.element_size())
+            reserve(partial)
+        (Path(folder) / "space").unlink()
+        # The values are written first, and then the list of leaves.
+        return data.make_memmap_from_tensor(key, leaf.cpu().contiguous())
 
 
 def open_leaf(data: TensorDictBase, key: NestedKey) -> bool:

@@ -291,6 +291,7 @@ def episode_parts(episodes: Iterable[ArraySet], lost: LostRows) -> Iterator[Part
     for number, arrays in enumerate(episodes):
         where = f"episode {number}"
         check_arrays(arrays.actions, "actions", where)
+        _check_flags(arrays, where)
         spans = FlatArrays(arrays, where, [entries(arrays.actions, "actions", where)])
         first = spans.lost if first is None else first
         if spans.lost != first:
@@ -300,6 +301,19 @@ def episode_parts(episodes: Iterable[ArraySet], lost: LostRows) -> Iterator[Part
                 f"{counts[1 - spans.lost]}: give the same for all"
             )
         yield from spans.parts(lost)
+
+
+def _check_flags(arrays: ArraySet, where: str) -> None:
+    """Raises if a flag of an end is set within the arrays of one episode."""
+    for name in ("terminals", "timeouts", "dones"):
+        flags = getattr(arrays, name)
+        early = np.zeros(0) if flags is None else np.asarray(flags).reshape(-1)[:-1]
+        if early.dtype.kind in "biuf" and early.any():
+            raise ValueError(
+                f"{name} of {where} is set in row {int(early.argmax())}, before the "
+                "last one, but an episode ends at such a flag: cut it there, or give a "
+                "lasting flag as info"
+            )
 
 
 def next_states(states: Any, achieved: Any, desired: Any, next_achieved: Any) -> Any:

@@ -248,9 +248,10 @@ class _Keys:
         root = {key for key in leaves if key[0] != "next"}
         # An info is no part of a state, even if both states have one.
         states = {key for key in root & following if key[0] != "info"}
-        self.states = sorted(states - {path_of(action)})
-        rest = root - states - {path_of(action)} - not_states
-        self.infos = sorted(rest)
+        own = path_of(action)
+        leaves = {k for k in root if k[: len(own)] != own}
+        self.states = sorted(states & leaves)
+        self.infos = sorted(leaves - states - not_states)
 
     def check(self, data: TensorDictBase, length: int) -> None:
         """Raises if the data lack entries or have zeros only."""
@@ -461,7 +462,9 @@ def _plain(value: torch.Tensor) -> torch.Tensor:
     return value.to(_WIDER.get(value.dtype, value.dtype))
 
 
-def _cast(value: torch.Tensor) -> torch.Tensor:
+def _cast(value: Any) -> Any:
+    if isinstance(value, TensorDictBase):  # nested actions
+        return value.apply(_cast)
     value = _plain(value)
     return value.float() if value.is_floating_point() else value
 

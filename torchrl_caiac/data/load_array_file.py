@@ -198,6 +198,12 @@ class _Archive(Mapping[str, Any]):
             if kind.shape:
                 whole = group if group in _ARGUMENTS else name
                 self._parts.setdefault(whole, []).append(name)
+        for whole, names in self._parts.items():
+            if whole in names and len(names) > 1:
+                raise ValueError(
+                    f"the file has the array {whole!r} and arrays below it, {names}: "
+                    "rename them, or pass the arrays to from_arrays"
+                )
 
     def __getitem__(self, name: str) -> Any:
         tree: dict[str, Any] = {}

@@ -49,6 +49,13 @@ class _Names(NamedTuple):
         names = (*self.observations, self.action, *self.following, *self.infos)
         return [*dict.fromkeys(names + self.others)]
 
+    def roles(self) -> dict[str, Any]:
+        """Returns which features are what, JSON values."""
+        return {
+            role: list(names) if isinstance(names, tuple) else names
+            for role, names in self._asdict().items()
+        }
+
 
 def load_lerobot(
     dataset: str | os.PathLike[str],
@@ -153,7 +160,7 @@ def load_lerobot(
         "version": description.version,
         "tasks": {str(index): text for index, text in description.tasks.items()},
         "columns": columns,
-        "features": names.all(),
+        "features": names.roles(),
     }
     lengths = description.lengths.values()
     return write_episodes(

@@ -86,9 +86,9 @@ def load_ogbench(
         path (str or Path): the folder to write. It is written atomically.
 
     Keyword Args:
-        split ("train" or "val"): the training or the validation data, of which the file
-            ends in ``-val.npz``. A file whose name ends so is read as it is. Defaults
-            to ``"train"``.
+        split ("train" or "val"): the training or the validation data. The file of the
+            latter ends in ``-val.npz``; a file whose name ends so is read as it is.
+            Defaults to ``"train"``.
         download (bool): whether to download a missing dataset into ``root``, which
             needs the package ``ogbench``. Defaults to ``False``.
         root (path, optional): the folder of OGBench's files. Defaults to ``None``:

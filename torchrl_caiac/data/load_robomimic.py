@@ -62,7 +62,7 @@ def load_robomimic(
     ``"observation"``. The columns of each are then logged, and stored as ``"columns"``
     of :func:`~torchrl_caiac.data.digests.data_source`.
 
-    The next observations are those of ``next_obs``. If there are none, and not one
+    The next observations are those of ``next_obs``. Without it, and unless there is one
     observation more than actions, the last action of each demonstration has no next
     observation, and its row is left out.
 

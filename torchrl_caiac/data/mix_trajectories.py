@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._files import reserve
+from torchrl_caiac._fingerprints import settings_of, state_hash
 from torchrl_caiac._keys import as_key, get_leaf
 from torchrl_caiac._keys import path as key_path
 from torchrl_caiac._torchrl import memmap_folder
@@ -157,7 +158,7 @@ def mix_trajectories(
         mixed = one.expand(total).apply(torch.empty_like)
         _fill(mixed, *fill, *keys)
         return mixed
-    with whole_transitions(path, keys=keys) as folder:
+    with whole_transitions(path, keys=keys, overwrite=overwrite) as folder:
         stored = one.cpu().expand(total).memmap_like(folder)
         reserve(folder)
         _fill(stored, *fill, *keys)
@@ -393,7 +394,43 @@ def _check_sources(
                     "overwrite: rename it, leave it out with exclude=, or pass "
                     "source_key= and source_trajectory_key="
                 )
+    _check_scores(sources, expected)
     return [key[0] if len(key) == 1 else key for key in expected]
+
+
+def _check_scores(
+    sources: Sequence[TensorDictBase], leaves: Iterable[tuple[str, ...]]
+) -> None:
+    """Raises if sources have scores of different settings, by their fingerprints."""
+    for key in leaves:
+        if not key[-1].endswith("_fingerprint"):
+            continue
+        found = [_settings(source, key) for source in sources]
+        known = [(number, one) for number, one in enumerate(found) if one is not None]
+        for number, settings in known[1:]:
+            first, other = known[0]
+            if settings != other:
+                scores = (*key[:-1], key[-1].removesuffix("_fingerprint"))
+                raise ValueError(
+                    f"{scores} of source {first} and source {number} were computed "
+                    "with other settings, such as another estimator: score the mixture "
+                    f"with one, and leave these scores out with exclude={[key[0]]}"
+                )
+
+
+# Rows of which the settings of scores are compared.
+_LOOKED_AT = 64
+
+
+def _settings(source: TensorDictBase, key: tuple[str, ...]) -> int | None:
+    """Returns what scores depend on; ``None`` if their states cannot be told."""
+    rows = source[:_LOOKED_AT]
+    state = state_hash(rows, ["observation"])
+    if state is None:
+        return None
+    after = state_hash(rows, [("next", "observation")])
+    found = (settings_of(rows.get(key), state, after) >> 16).unique()
+    return int(found) if len(found) == 1 and len(rows) > 1 else None
 
 
 def _structure(

@@ -104,6 +104,7 @@ class TransitionWriter:
         if action_bounds is not None:
             action_bounds = check_action_bounds(*action_bounds)
         self.path = Path(path)
+        self._overwrite = overwrite
         self.source = source
         self.episodes = self.rows = 0
         self._bounds, self._expected_rows = action_bounds, rows
@@ -116,7 +117,9 @@ class TransitionWriter:
 
     def __enter__(self) -> TransitionWriter:
         with ExitStack() as stack:
-            self._folder = stack.enter_context(whole_transitions(self.path))
+            self._folder = stack.enter_context(
+                whole_transitions(self.path, overwrite=self._overwrite)
+            )
             stack.push(self._finish)
             self._stack = stack.pop_all()
         return self

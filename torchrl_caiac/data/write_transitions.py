@@ -115,7 +115,10 @@ def check_key_names(keys: Iterable[NestedKey], what: str) -> None:
 
 @contextmanager
 def whole_transitions(
-    path: str | os.PathLike[str], *, keys: Iterable[NestedKey] | None = None
+    path: str | os.PathLike[str],
+    *,
+    keys: Iterable[NestedKey] | None = None,
+    overwrite: bool = True,
 ) -> Iterator[Path]:
     """Context manager that writes a folder of transitions atomically.
 
@@ -129,11 +132,14 @@ def whole_transitions(
     Keyword Args:
         keys (iterable of NestedKey, optional): the keys that the transitions must have.
             Defaults to ``None``: those of ``load_transitions``.
+        overwrite (bool): whether a folder may be replaced that is there at the end.
+            Defaults to ``True``.
 
     Yields:
         Path: a temporary folder on the same file system, to be created in the block.
 
     Raises:
+        FileExistsError: another process has written ``path`` meanwhile.
         ValueError: the new folder cannot be opened. ``path`` is unchanged.
 
     Examples:
@@ -150,6 +156,7 @@ def whole_transitions(
     """
     with whole_folder(path) as folder:
         yield folder
+        check_free(path, overwrite)
         try:
             if keys is None:
                 load_transitions(folder)
@@ -265,7 +272,7 @@ def write_parts(
     check_entries(like)
     if action_bounds is not None:
         check_bounds_fit(like, action_bounds)
-    with whole_transitions(path) as folder:
+    with whole_transitions(path, overwrite=overwrite) as folder:
         stored = like.memmap_like(folder)
         reserve(folder)
         start = 0

@@ -205,7 +205,7 @@ class BatchCheck:
         crosses: torch.Tensor | None,
     ) -> CheckedScores:
         if not LateCheck.needed(scores.device) and bool(scores.isinf().any()):
-            self._explain_scores(scores)
+            self._explain_scores(scores.masked_fill(scores.isnan(), 0))
         if is_valid is not None:
             where = is_valid.view(-1, *(1,) * (scores.ndim - 1))
             scores = torch.where(where, scores, math.nan)

@@ -88,10 +88,11 @@ class CAIACTransform(CounterfactualTransform):
             ``"goal"``: nor are, besides the next one, entities that are influenced
             before the goal that :class:`~torchrl_caiac.transforms.WindowGoal` drew for
             the row. A swapped entity then does not move between the row and its goal.
-            ``None``: only the row's own score counts, as in Algorithm 1. It reads the
-            trajectories of the buffer that samples (one buffer, no
+            ``None``: only the row's own score counts, as in Algorithm 1. All but
+            ``None`` read the trajectories of the buffer that samples (one buffer, no
             :class:`~torchrl.data.ReplayBufferEnsemble`), and of the donor buffer, with
-            one byte for each of their rows and entities. Defaults to ``None``.
+            one byte for each row and entity that their storages have room for, two with
+            ``"goal"``. Defaults to ``None``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
             Defaults to the rows of the same batch. A donor buffer needs scores and the
             same layout. It is pickled with the transform.

@@ -209,10 +209,16 @@ class CounterfactualTransform(RandomTransform, ABC):
                 "goals draws the goals of donor windows of a donor buffer, and there "
                 "is none: donors in the batch keep their own goals"
             )
-        if goals.window != self.window or goals.layout != self.layout:
+        if goals.window != self.window:
             raise ValueError(
-                f"goals has window {goals.window} and its own layout, the transform "
-                f"has window {self.window}: both must be the same"
+                f"goals has window {goals.window}, the transform {self.window}: create "
+                "WindowGoal with the window of the transform"
+            )
+        if goals.layout != self.layout:
+            raise ValueError(
+                f"goals has another layout, of {list(goals.layout.names)}, than the "
+                f"transform, of {list(self.layout.names)}: create WindowGoal with the "
+                "layout of the transform"
             )
 
     # --- defined by subclasses -------------------------------------------------------

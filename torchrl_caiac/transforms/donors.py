@@ -20,9 +20,15 @@ from torchrl_caiac._fingerprints import (
     upper_half,
 )
 from torchrl_caiac._sampling import DonorRows, is_native
-from torchrl_caiac._torchrl import leaf_of, storage_revision, storage_rows
+from torchrl_caiac._torchrl import (
+    leaf_of,
+    sampling_buffer,
+    storage_revision,
+    storage_rows,
+)
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
+from torchrl_caiac.influence.score_record import read_record
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 from torchrl_caiac.transforms.draws import (
     DonorBits,
@@ -293,10 +299,32 @@ class BufferDonors:
                 trajectory_key=self.keys.trajectory,
                 done_key=self.keys.done,
             )
+        self._check_estimator(storage, data)
         scores = valid_scores(data, self.score_key, self.layout, len(storage))
         if self.lookahead is not None:
-            scores = hold_entities(scores, self.lookahead.table(self.donors))
+            locked = self.lookahead.table(self.donors)
+            length = min(len(scores), len(locked))  # rows may be added meanwhile
+            scores = hold_entities(scores[:length], locked[:length])
         return self.eligible(scores, trajectories), trajectories, data
+
+    def _check_estimator(self, storage: TensorStorage, data: TensorDictBase) -> None:
+        """Raises if donors have scores of another estimator than what is sampled."""
+        buffer = sampling_buffer()
+        sampled = None if buffer is None else buffer.storage
+        if sampled is storage or not isinstance(sampled, TensorStorage):
+            return
+        rows = storage_rows(sampled, "the buffer")
+        records = [
+            read_record(of, td, self.score_key)
+            for of, td in ((sampled, rows), (storage, data))
+        ]
+        found = {r["settings"]["estimator"] for r in records if r is not None}
+        if len(found) > 1:
+            raise ValueError(
+                f"{self.score_key!r} of the donors was computed by another estimator "
+                "than that of the buffer, so that one threshold does not suit both: "
+                "score both with the same one, score_buffer(..., overwrite=True)"
+            )
 
     def draw(
         self,

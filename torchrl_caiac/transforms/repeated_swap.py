@@ -68,8 +68,8 @@ class RepeatedSwap:
         settings (SwapSettings): those of the transform.
         is_unfit (bool): whether an earlier batch has shown that batches have to be
             swapped step by step: states of windows on a CUDA device are not the next
-            states before them, what may be swapped has another form, or donors of a
-            buffer need torch.
+            states before them, what may be swapped is not bool ``[B, N]``, or donors of
+            a buffer need torch.
 
     Args:
         td (TensorDictBase): the earlier batch, ``[B * window]``, before it was swapped.

@@ -72,10 +72,16 @@ def goal_vectors(
     achieved, desired = _goal_vectors(td, layout, first)
     if achieved is None or desired is None:
         what = "next achieved goals" if achieved is None else "desired goals"
+        if layout.is_flat:
+            keys = [layout.desired_goal_key, layout.next(layout.achieved_goal_key)]
+        else:
+            keys = [key for key in layout.goal.values() if key is not None]
+            keys += [layout.next(k) for k in layout.achieved.values() if k is not None]
+            what = "goals"
+        lacking = [key for key in keys if td.get(key, None) is None]
         raise KeyError(
-            f"reward_fn or terminated_fn is given, but the batch has no {what}: the "
-            f"layout looks under {layout.desired_goal_key!r} and "
-            f"{layout.achieved_goal_key!r} (or its `goal` and `achieved` keys)"
+            f"reward_fn or terminated_fn is given, but the batch has no {what}: it "
+            f"lacks {lacking}. Store them, or correct goal and achieved of the layout"
         )
     return achieved, desired
 

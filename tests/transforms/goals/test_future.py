@@ -150,3 +150,66 @@ def test_nested_goals(chosen: list[int] | None) -> None:
         ]
         values = [leaf.flatten().tolist() for leaf in found.values()]
         assert values == [wanted, wanted, [-value for value in wanted]]
+
+
+# --- the rows that were drawn --------------------------------------------------------
+
+
+def sampling(kind: str, transform, *, after: bool = False, **options) -> ReplayBuffer:
+    """A buffer that draws goals, with a transform before them, or after them."""
+    goals = (
+        WindowGoal(FLAT, 1, **options)
+        if kind == "window"
+        else HindsightGoal(FLAT, lambda a, b: -(a != b).any(-1).float(), **options)
+    )
+    state = torch.arange(80, dtype=torch.float64).view(20, 4)
+    data = TensorDict(
+        {
+            "observation": state,
+            "desired_goal": torch.zeros(20, 2, dtype=torch.float64),
+            "episode": torch.zeros(20, dtype=torch.int64),
+            "next": {"observation": state + 4, "reward": -torch.ones(20, 1)},
+        },
+        [20],
+    )
+    data["next", "done"] = torch.arange(20).view(20, 1) == 19
+    rb = ReplayBuffer(
+        storage=LazyTensorStorage(20), sample_unit=goals, batch_size=16, transform=None
+    )
+    rb.extend(data)
+    for one in (goals, transform) if after else (transform, goals):
+        rb.append_transform(one)
+    return rb
+
+
+def normalised(td: TensorDict) -> TensorDict:
+    for key in ("observation", ("next", "observation")):
+        td[key] = td[key] / 3
+    return td
+
+
+@pytest.mark.parametrize("kind", ["window", "hindsight"])
+@pytest.mark.parametrize("change", [normalised, lambda td: td.flip(0)])
+def test_goals_are_not_those_of_other_states(kind, change) -> None:
+    rb = sampling(kind, change)
+    with pytest.raises(ValueError, match="Goal before transforms that change or"):
+        rb.sample()
+    sampling(kind, change, after=True).sample()
+
+
+@pytest.mark.parametrize("kind", ["window", "hindsight"])
+def test_states_may_be_cast_first(kind) -> None:
+    rb = sampling(kind, lambda td: td.float())
+    assert rb.sample()["desired_goal"].shape == (16, 2)
+
+
+def test_rewards_compare_goals_that_are_rounded_alike() -> None:
+    """Goals in single precision, and states in double precision."""
+
+    def single(td: TensorDict) -> TensorDict:
+        td["desired_goal"] = td["desired_goal"].float()
+        return td
+
+    rb = sampling("hindsight", single, future=1.0, p=1.0)
+    rb.storage[:]["next", "observation"].add_(0.1)
+    assert (rb.sample()["next", "reward"] == 0).all()

@@ -25,6 +25,8 @@ from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = ["FutureGoal"]
 
+_COMPARED = 10  # batches, with the rows that the buffer drew
+
 
 class FutureGoal(RandomTransform, SampleUnit):
     """Draws goals from a storage in ``expand``, for ``forward`` to write.
@@ -87,6 +89,7 @@ class FutureGoal(RandomTransform, SampleUnit):
         # Separate for each thread: a buffer prefetches in threads, which draw and
         # apply.
         self._pending = threading.local()
+        self._to_compare = _COMPARED
         self._cache = TrajectoryCache(
             trajectory_key=self.keys.trajectory, done_key=self.keys.done
         )
@@ -136,6 +139,52 @@ class FutureGoal(RandomTransform, SampleUnit):
             goals (dict): the goals by desired-goal leaf.
         """
         self._pending.goals = goals, sampling_buffer() is not None
+
+    def keep_own(self, data: TensorDictBase, rows: torch.Tensor) -> None:
+        """Keeps what the drawn rows achieve, to compare the first batches with it.
+
+        Args:
+            data (TensorDictBase): the rows of the storage, ``[T]``.
+            rows (torch.Tensor): int64 ``[B]``, those that were drawn.
+        """
+        if self._to_compare:
+            # On an accelerator the host waits for the comparison, so only once.
+            is_on_cpu = rows.device.type == "cpu"
+            self._to_compare = self._to_compare - 1 if is_on_cpu else 0
+            self._pending.own = self.read_goals(data, rows)
+
+    def check_own(self, td: TensorDictBase) -> None:
+        """Raises if the rows of a batch are not those that the buffer drew.
+
+        Goals come from the storage. After a transform that changes the states, or the
+        order of rows, they would be those of other states.
+
+        Args:
+            td (TensorDictBase): the batch, ``[B]``, with counterfactuals or not.
+
+        Raises:
+            ValueError: the real rows achieve something else.
+        """
+        drawn = self._pending.__dict__.pop("own", None)
+        if drawn is None or sampling_buffer() is None:
+            return
+        flags = leaf_of(td, self.keys.counterfactual)
+        for key, achieved in self.read_goals(td).items():
+            own = drawn.get(key, None)
+            if own is None or own.shape != achieved.shape:
+                continue  # another error says more
+            own = own.to(achieved)
+            differ = (own != achieved) & ~(own.isnan() & achieved.isnan())
+            differ = differ.reshape(len(differ), -1).any(1)
+            if flags is not None:
+                differ &= ~flags.reshape(-1)
+            if bool(differ.any()):
+                raise ValueError(
+                    f"the next states of {int(differ.sum())} of {len(differ)} rows are "
+                    "not those that the buffer drew, from which goals are taken: "
+                    f"append {type(self).__name__} before transforms that change or "
+                    "reorder rows, such as a normalisation"
+                )
 
     def take_goals(self) -> dict[NestedKey, torch.Tensor] | None:
         """Returns the goals that were kept for this batch, and forgets them.

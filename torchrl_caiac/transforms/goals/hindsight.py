@@ -247,6 +247,7 @@ class HindsightGoal(FutureGoal):
                 )
                 goals = self.read_goals(data, trajectories.later(rows, steps))
             self.keep_goals(goals)
+            self.keep_own(data, rows)
         return index, info
 
     def generate_parameters(
@@ -380,14 +381,16 @@ class HindsightGoal(FutureGoal):
     ) -> tuple[Goals, torch.Tensor, torch.Tensor]:
         """Returns goals, achieved goals and which are new."""
         relabeled = (draw.source >= td.shape[0]).unsqueeze(-1)
-        achieved = self.read_goals(td)
         goals: Goals = {}
-        for key, reached in achieved.items():
+        achieved: Goals = {}
+        for key, reached in self.read_goals(td).items():
             desired = self._desired(td, key, reached)
             # Stored integers must not cut the goals that are reached.
             if not holds(desired.dtype, reached.dtype):
                 desired = floating(desired).to(floating(reached).dtype)
-            parts = [desired, reached.to(desired)]
+            # Rewards compare numbers that are rounded alike.
+            achieved[key] = reached.to(desired)
+            parts = [desired, achieved[key]]
             if draw.future is not None:
                 parts.append(draw.future[key].to(desired))
             goals[key] = torch.cat(parts).index_select(0, draw.source)
@@ -428,6 +431,7 @@ class HindsightGoal(FutureGoal):
             ValueError: goals or rewards have the wrong shape.
         """
         self.warn_if_forked()
+        self.check_own(tensordict)
         goals = self.take_goals()
         repeated = self._repeated  # which another thread may replace
         if repeated is not None and repeated.keys == self.keys:

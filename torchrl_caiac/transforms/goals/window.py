@@ -184,6 +184,7 @@ class WindowGoal(FutureGoal):
         if goals is None:
             goals = self._read(data, trajectories, rows, numbers)
         self.keep_goals(goals)
+        self.keep_own(data, rows)
         return index, info
 
     def _read_at_once(
@@ -314,6 +315,7 @@ class WindowGoal(FutureGoal):
                 already.
         """
         self.warn_if_forked()
+        self.check_own(tensordict)
         goals = self.take_goals()
         if goals is None:
             raise self.no_goals()
