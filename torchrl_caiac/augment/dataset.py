@@ -309,9 +309,8 @@ def _single_steps(parts: Iterator[TensorDictBase]) -> Iterator[TensorDictBase]:
     for part in parts:
         after = part["next"]
         after["done"] = torch.ones_like(after["done"])
-        terminated, truncated = (
-            after.get(f"{n}ated", None) for n in ("termin", "trunc")
-        )
+        terminated = after.get("terminated", None)
+        truncated = after.get("truncated", None)
         if terminated is not None:
             after["truncated"] = (terminated == 0).to(terminated.dtype)
         elif truncated is not None:

@@ -5,20 +5,16 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch
 from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import (
-    recover_meta,
-    reserve,
-    safe_meta,
-    whole_file,
-    write_json,
-)
+from torchrl_caiac._files import recover_meta, reserve, safe_meta, write_json
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac._torchrl import (
@@ -28,6 +24,7 @@ from torchrl_caiac._torchrl import (
     memmap_folder,
     set_memmap_entry,
 )
+from torchrl_caiac._whole_files import naming_full_disk
 from torchrl_caiac.data.write_transitions import check_entries, check_key_names
 
 __all__ = ["add_leaf", "new_leaf", "open_leaf", "remove_leaf", "store_leaves"]
@@ -257,11 +254,9 @@ def _stored(data: TensorDictBase, key: NestedKey, leaf: torch.Tensor) -> torch.T
         return new_leaf(data, key, leaf.shape, leaf.dtype).copy_(leaf)
     with safe_meta(folder):
         # A full disk would kill the process while it writes to mapped memory.
-        with whole_file(Path(folder) / "space") as partial:
-            with partial.open("wb") as file:
-                file.truncate(leaf.numel() * leaf.element_size())
-            reserve(partial)
-        (Path(folder) / "space").unlink()
+        with naming_full_disk(folder), TemporaryFile(dir=folder) as file:
+            size = leaf.numel() * leaf.element_size()
+            os.posix_fallocate(file.fileno(), 0, max(1, size))
         # The values are written first, and then the list of leaves.
         return data.make_memmap_from_tensor(key, leaf.cpu().contiguous())
 

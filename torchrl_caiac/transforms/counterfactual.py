@@ -209,16 +209,11 @@ class CounterfactualTransform(RandomTransform, ABC):
                 "goals draws the goals of donor windows of a donor buffer, and there "
                 "is none: donors in the batch keep their own goals"
             )
-        if goals.window != self.window:
+        if goals.window != self.window or goals.layout != self.layout:
             raise ValueError(
-                f"goals has window {goals.window}, the transform {self.window}: create "
-                "WindowGoal with the window of the transform"
-            )
-        if goals.layout != self.layout:
-            raise ValueError(
-                f"goals has another layout, of {list(goals.layout.names)}, than the "
-                f"transform, of {list(self.layout.names)}: create WindowGoal with the "
-                "layout of the transform"
+                f"goals has window {goals.window} and entities "
+                f"{list(goals.layout.names)}, the transform window {self.window} and "
+                f"{list(self.layout.names)}: give WindowGoal its window and its layout"
             )
 
     # --- defined by subclasses -------------------------------------------------------
