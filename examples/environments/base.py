@@ -89,14 +89,20 @@ class Environment(ABC):
         """The folder of everything that depends on the training data."""
         return self.out
 
-    def check(self) -> None:  # noqa: B027
-        """Raises if a setting of the evaluation is wrong, before anything is collected.
+    def check(self) -> None:
+        """Raises if a setting of the evaluation is wrong, before data are collected."""
+        for name in ("episodes", "validation_episodes"):
+            number = self.settings.evaluate.get(name, 1)
+            if type(number) is not int or number < 1:
+                raise ValueError(
+                    f"env.evaluate.{name} is {number!r}, expected an integer of at "
+                    "least 1"
+                )
 
-        Defaults to no check.
-        """
-
-    def check_demonstrations(self) -> None:  # noqa: B027
-        """Raises if the settings leave no demonstrations. Defaults to no check."""
+    @property
+    def has_demonstrations(self) -> bool:
+        """Whether there are demonstrations to imitate, by the settings."""
+        return True
 
     @abstractmethod
     def collect(self, *, progress: bool = False) -> None:

@@ -154,16 +154,12 @@ class FetchPush(Environment):
 
     def demonstrations(self) -> TensorDictBase:
         """Returns the demonstrations up to their first success."""
-        self.check_demonstrations()
         return load_transitions(self.folder / "demonstrations")
 
-    def check_demonstrations(self) -> None:
-        """Raises if there are none."""
-        if self.settings.demonstrations is None:
-            raise ValueError(
-                "env.demonstrations is null, so that there are none to imitate: set "
-                "how many successful episodes to learn from"
-            )
+    @property
+    def has_demonstrations(self) -> bool:
+        """Whether a number of successful episodes is set."""
+        return self.settings.demonstrations is not None
 
     def simulator(self, num_actions: int) -> SimulatorInfluence:
         """Returns the simulator as an estimator."""

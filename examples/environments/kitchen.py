@@ -67,6 +67,7 @@ class Kitchen(Environment):
 
     def check(self) -> None:
         """Raises if a task is not known, or the splits have starts in common."""
+        super().check()
         tasks = list(self.settings.evaluate.tasks)
         if not tasks or not set(tasks) <= set(KITCHEN_TASKS):
             raise ValueError(

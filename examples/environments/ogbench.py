@@ -106,6 +106,7 @@ class OGBench(Environment):
 
     def check(self) -> None:
         """Raises if a task is not known, or the splits have starts in common."""
+        super().check()
         self._seeds("test")
 
     @property

@@ -10,7 +10,11 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss, LossModule
 
 from learners.goal_conditioned import GoalConditioned, descend
-from learners.imitation import future_goals, imitation_buffer
+from learners.imitation import (
+    check_demonstrations,
+    future_goals,
+    imitation_buffer,
+)
 from learners.settings import NotNegative, Positive
 
 __all__ = ["BC"]
@@ -39,7 +43,7 @@ class BC(GoalConditioned):
         """Raises if a setting is wrong; see the base class."""
         super().check(further)
         environment = self.environment
-        environment.check_demonstrations()
+        check_demonstrations(self)
         if self.swaps_after_goals or self.settings.future_goals is not None:
             future_goals(self, self.window)  # or raises
         if not (self.swaps_after_goals or environment.demonstrations_have_goals):

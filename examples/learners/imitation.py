@@ -12,7 +12,17 @@ from learners.base import Learner
 from torchrl_caiac.data import offline_buffer
 from torchrl_caiac.transforms import WindowGoal
 
-__all__ = ["future_goals", "imitation_buffer", "window_goals"]
+__all__ = ["check_demonstrations", "future_goals", "imitation_buffer", "window_goals"]
+
+
+def check_demonstrations(learner: Learner) -> None:
+    """Raises if the environment has no demonstrations to imitate."""
+    environment = learner.environment
+    if not environment.has_demonstrations:
+        raise ValueError(
+            f"{type(environment).__name__} has no demonstrations to imitate, as "
+            "env.demonstrations is null: set how many successful episodes to learn from"
+        )
 
 
 def future_goals(learner: Learner, window: int = 1) -> WindowGoal:

@@ -11,7 +11,11 @@ from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
 from learners.base import Learner
-from learners.imitation import imitation_buffer, window_goals
+from learners.imitation import (
+    check_demonstrations,
+    imitation_buffer,
+    window_goals,
+)
 from learners.settings import Count, NotNegative, Positive
 from torchrl_caiac.modules import LMPActor, LMPModel
 from torchrl_caiac.objectives import LMPLoss
@@ -42,7 +46,7 @@ class LMP(Learner):
     def check(self, further: int = 0) -> None:
         """Raises if a setting is wrong; see the base class."""
         super().check(further)
-        self.environment.check_demonstrations()
+        check_demonstrations(self)
         self.make_goals()  # or raises
 
     @property

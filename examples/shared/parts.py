@@ -44,13 +44,6 @@ class ValidationSettings(BaseSettings):
     policies: Count | None
 
 
-class EvaluateSettings(BaseSettings):
-    """What the settings ``env.evaluate`` may be, besides those of environments."""
-
-    episodes: Count = 1
-    validation_episodes: Count = 1
-
-
 def make_environment(cfg: DictConfig) -> Environment:
     """Returns the environment ``cfg.env``."""
     # Some packages print notices when they are imported.
@@ -113,7 +106,6 @@ def check_learner(cfg: DictConfig, method: str, further: int = 0) -> None:
 
 def _checked(cfg: DictConfig, method: str, further: int = 0) -> Learner:
     check_settings_of("validation", cfg.validation, ValidationSettings)
-    check_settings_of("env.evaluate", cfg.env.evaluate, EvaluateSettings)
     learner = new_learner(cfg, method)
     learner.environment.check()
     learner.check(further)

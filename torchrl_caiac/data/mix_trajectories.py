@@ -411,10 +411,11 @@ def _check_scores(
             first, other = known[0]
             if settings != other:
                 scores = (*key[:-1], key[-1].removesuffix("_fingerprint"))
+                names = [key[0]] if len(key) > 1 else [*scores, *key]
                 raise ValueError(
                     f"{scores} of source {first} and source {number} were computed "
                     "with other settings, such as another estimator: score the mixture "
-                    f"with one, and leave these scores out with exclude={[key[0]]}"
+                    f"with one, and leave these scores out with exclude={names}"
                 )
 
 

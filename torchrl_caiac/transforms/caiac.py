@@ -90,12 +90,12 @@ class CAIACTransform(CounterfactualTransform):
             the row. A swapped entity then does not move between the row and its goal.
             ``None``: only the row's own score counts, as in Algorithm 1. All but
             ``None`` read the trajectories of the buffer that samples (one buffer, no
-            :class:`~torchrl.data.ReplayBufferEnsemble`), and of the donor buffer, with
-            one byte for each row and entity that their storages have room for, two with
-            ``"goal"``. Defaults to ``None``.
+            :class:`~torchrl.data.ReplayBufferEnsemble`), and of the donor buffer. This
+            takes one byte per entity and row of the storage's capacity, or two bytes
+            with ``"goal"``. Defaults to ``None``.
         donors (ReplayBuffer or TensorStorage, optional): where donors are drawn from.
-            Defaults to the rows of the same batch. A donor buffer needs scores and the
-            same layout. It is pickled with the transform.
+            Defaults to the rows of the same batch. A donor buffer needs scores of the
+            same estimator, and the same layout. It is pickled with the transform.
         score_key (NestedKey): the scores, ``[*, N]``. Defaults to
             ``("caiac", "score")``.
         unscored (str): what happens to rows that have no score, or one of another

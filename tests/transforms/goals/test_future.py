@@ -213,3 +213,25 @@ def test_rewards_compare_goals_that_are_rounded_alike() -> None:
     rb = sampling("hindsight", single, future=1.0, p=1.0)
     rb.storage[:]["next", "observation"].add_(0.1)
     assert (rb.sample()["next", "reward"] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["window", "hindsight"])
+def test_a_sample_that_failed_is_not_compared_later(kind) -> None:
+    fails = [False] * 9 + [True]
+
+    def sometimes(td: TensorDict) -> TensorDict:
+        if fails and fails.pop(0):
+            raise ArithmeticError
+        return td
+
+    rb = sampling(kind, sometimes)
+    for _ in range(9):
+        rb.sample()
+    with pytest.raises(ArithmeticError):
+        rb.sample()
+    rb.sample()
+
+
+def test_batches_may_be_reshaped_first() -> None:
+    rb = sampling("hindsight", lambda td: td.reshape(4, 4), future=1.0)
+    assert rb.sample()["desired_goal"].shape == (4, 4, 2)

@@ -152,6 +152,8 @@ class FutureGoal(RandomTransform, SampleUnit):
             is_on_cpu = rows.device.type == "cpu"
             self._to_compare = self._to_compare - 1 if is_on_cpu else 0
             self._pending.own = self.read_goals(data, rows)
+        else:  # nor those of a sample that failed
+            self._pending.own = None
 
     def check_own(self, td: TensorDictBase) -> None:
         """Raises if the rows of a batch are not those that the buffer drew.
@@ -168,6 +170,7 @@ class FutureGoal(RandomTransform, SampleUnit):
         drawn = self._pending.__dict__.pop("own", None)
         if drawn is None or sampling_buffer() is None:
             return
+        td = td.reshape(-1)
         flags = leaf_of(td, self.keys.counterfactual)
         for key, achieved in self.read_goals(td).items():
             own = drawn.get(key, None)
