@@ -85,6 +85,7 @@ def bench_attention(
     """Scoring with attention, and the same rows through the model alone."""
     layout, action_dim, layers = MODELS[name]
     model = TransformerWorldModel(layout, action_dim, layers).to(device).eval()
+    model.fitted = True  # its weights do not matter for the time
     estimator = AttentionInfluence(model)
     rows = STATES[device.type]
     width = model.state_dim

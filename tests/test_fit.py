@@ -586,11 +586,13 @@ def test_checkpoints_record_the_bounds(tmp_path: Path) -> None:
 
 def test_discrete_actions_are_refused() -> None:
     data = world(60)
-    data["action"] = torch.nn.functional.one_hot(torch.arange(60) % 2)
+    choice = torch.arange(60) % 2
+    data["action"] = torch.nn.functional.one_hot(choice).float()
     with pytest.raises(ValueError, match=r"'action' is one-hot .* MotionInfluence"):
         fit(make(), data)
-    with pytest.raises(ValueError, match=r"\[60\], expected \[60, 2\]: store them as"):
-        fit(make(), data.set("action", torch.arange(60) % 2))
+    for action in (choice, choice.unsqueeze(-1), choice.bool()):
+        with pytest.raises(ValueError, match=r"'action' is torch.*MotionInfluence"):
+            fit(make(), data.set("action", action))
 
 
 def test_corrected_trajectories_are_other_data(tmp_path: Path) -> None:
@@ -613,3 +615,16 @@ def test_a_floor_from_the_data_is_checked(caplog: pytest.LogCaptureFixture) -> N
     with caplog.at_level("WARNING"):
         fit(model, data)
     assert "floor_too_high" in caplog.text
+
+
+def test_a_refused_fit_leaves_no_floor(tmp_path: Path) -> None:
+    good, bad = world(400), world(400)
+    bad["next", "observation"] *= 1000
+    model, fresh = (make(variance_floor="auto") for _ in range(2))
+    fit(make(variance_floor="auto"), good, checkpoint=tmp_path / "fit")
+    with pytest.raises(ValueError, match="data_checksum"):
+        fit(model, bad, checkpoint=tmp_path / "fit")
+    assert not model.has_floor and model.floor.isnan().all()
+    fit(model, good)
+    fit(fresh, good)
+    assert torch.equal(model.floor, fresh.floor)

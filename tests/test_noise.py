@@ -207,3 +207,19 @@ def test_joint_angles_are_not_compared_with_positions() -> None:
     same = {"arm": [0, 1, 2], "cup": [3, 4]}  # as many numbers: maybe one frame
     other = EntityLayout(same, positions=same)
     assert max(resting_noise(transitions(change), other)["cup"].floor) > 3e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float64])
+def test_whole_numbers_far_from_zero_have_no_rounding(dtype: torch.dtype) -> None:
+    """Those below 2**24 are single precision numbers too."""
+    position = 15_000_000 + torch.zeros(200, dtype=dtype)
+    position[100:] += 5 * torch.arange(100)
+    data = TensorDict(
+        {
+            "observation": position[:-1, None],
+            ("next", "observation"): position[1:, None],
+        },
+        [199],
+    )
+    cup = resting_noise(data, EntityLayout({"cup": [0]}))["cup"]
+    assert cup.rest_share == pytest.approx(100 / 199) and cup.tolerance[0] < 5

@@ -30,6 +30,7 @@ from torchrl_caiac._whole_files import (
 
 __all__ = [
     "UnreadableFileError",
+    "allocate",
     "check_archive",
     "claim_folder",
     "meta_state",
@@ -112,7 +113,7 @@ def _reserve_file(file: Path, nbytes: int) -> None:
     try:
         os.ftruncate(descriptor, nbytes)
         if nbytes:
-            _allocate(descriptor, nbytes)
+            allocate(descriptor, nbytes)
     except OSError as error:
         if before is None:
             file.unlink()
@@ -130,7 +131,16 @@ def _reserve_file(file: Path, nbytes: int) -> None:
         os.close(descriptor)
 
 
-def _allocate(descriptor: int, nbytes: int) -> None:
+def allocate(descriptor: int, nbytes: int) -> None:
+    """Allocates the space of an open file, or checks that there is enough of it.
+
+    Args:
+        descriptor (int): the file.
+        nbytes (int): its size, at least 1.
+
+    Raises:
+        OSError: with ``errno.ENOSPC``, the disk has too little space.
+    """
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(descriptor, 0, nbytes)

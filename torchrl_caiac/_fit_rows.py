@@ -18,6 +18,10 @@ from torchrl_caiac.trajectories import trajectory_index
 __all__ = ["CHUNK", "FitRows", "split_rows", "trajectory_numbers"]
 
 CHUNK = 65_536  # rows read from the data at once
+_NOT_CONTINUOUS = (
+    "but world models read continuous actions: for discrete ones use MotionInfluence "
+    "or ResidualInfluence"
+)
 
 
 class FitRows:
@@ -66,9 +70,7 @@ class FitRows:
                 self.block[first : first + len(part)] = part
         if is_discrete:
             raise ValueError(
-                f"{model.action_key!r} is one-hot in all rows, but world models read "
-                "continuous actions: for discrete ones use MotionInfluence or "
-                "ResidualInfluence"
+                f"{model.action_key!r} is one-hot in all rows, {_NOT_CONTINUOUS}"
             )
         if self.block is not None:
             self.block = self.block.to(self.device)
@@ -85,6 +87,11 @@ class FitRows:
                     "the data lack the action",
                     "name its leaf with the model's action_key",
                 )
+                if not action.is_floating_point():
+                    raise ValueError(
+                        f"{model.action_key!r} is {action.dtype}, {_NOT_CONTINUOUS}. "
+                        "Convert actions that are amounts to floating point"
+                    )
                 state = model.layout.read(part)
                 after = model.layout.read(part, next=True)
                 own = "give the data that the model's layout describes"

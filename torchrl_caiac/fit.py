@@ -25,6 +25,7 @@ from torchrl_caiac._keys import as_key, jsonable
 from torchrl_caiac.check import check_before_use
 from torchrl_caiac.checkpoint import TrainingCheckpoint
 from torchrl_caiac.modules._action_bounds import filled_bounds, known_bounds
+from torchrl_caiac.modules._variance_floor import FoundFloor
 from torchrl_caiac.modules.entity_dynamics_model import EntityDynamicsModel
 
 __all__ = ["fit_world_model"]
@@ -125,7 +126,7 @@ def fit_world_model(
         KeyError: a key is missing in the data.
         ValueError: an argument is out of range; the data are empty, contain NaN or
             infinite values, do not fit the model, or have fewer than two trajectories;
-            an action is outside of its bounds by more than 1e-4 of their width; bounds
+            an action is outside of its bounds by more than 1e-3 of their width; bounds
             of several datasets differ; the checkpoint is truncated, or was made with
             other settings or data.
         RuntimeError: the loss is not finite; with ``distributed``, there is no
@@ -189,10 +190,9 @@ def fit_world_model(
         max_validation_rows,
         generator,
     )
-    if not model.has_floor:
-        model.fit_variance_floor(sources)
+    found = None if model.has_floor else model.floor_from(sources)
     if check:
-        _check(model, sources, key)
+        _check(model, sources, key, found)
     fit = _Fit(model, lr, generator)
     settings: dict[str, Any] = {
         "model": model.config,
@@ -227,6 +227,8 @@ def fit_world_model(
     # Ranks agree before they wait for each other's gradients.
     every = {"steps": steps, "checkpoint_every": checkpoint_every}
     ranks.check_same({**settings, **every, "keeps": keeper is not None}, fit.step)
+    if found is not None and not model.has_floor:  # a checkpoint has it
+        model.set_floor(found)
     if not model.fitted:
         model.fit_statistics(rows.raw_targets(train))
     model.set_action_bounds(low, high)
@@ -275,12 +277,15 @@ def fit_world_model(
 
 
 def _check(
-    model: EntityDynamicsModel, sources: Sequence[TensorDictBase], key: NestedKey
+    model: EntityDynamicsModel,
+    sources: Sequence[TensorDictBase],
+    key: NestedKey,
+    found: FoundFloor | None,
 ) -> None:
     floors = None
     # The floor of absolute targets is not that of changes.
-    if model.has_floor and model.target == "change":
-        floors = model.entity_floors()
+    if model.target == "change":
+        floors = model.entity_floors(found)
     for td in sources:
         if len(td):
             check_before_use(

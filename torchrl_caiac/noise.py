@@ -148,18 +148,18 @@ def _rounding(dtype: torch.dtype, values: torch.Tensor) -> torch.Tensor:
     """Returns the rounding of stored numbers ``[n, W]``, ``[W]``.
 
     Double precision numbers are often made of single precision ones. If not, changes
-    that are tiny next to the range of a column are those of a simulator at rest.
+    that are tiny next to the range of a column are those of a simulator at rest. Whole
+    numbers, which integers are read as, have no rounding.
     """
     largest = values.abs().amax(0)
-    if not dtype.is_floating_point:
-        return torch.zeros_like(largest)
     if dtype != torch.float64:
         return torch.finfo(dtype).eps * largest
     single = torch.finfo(torch.float32).eps
     is_single = (values.float().double() == values).all(0)
     spread = values.amax(0) - values.amin(0)
     fine = torch.maximum(single * spread, torch.finfo(dtype).eps * largest)
-    return torch.where(is_single, single * largest, fine)
+    found = torch.where(is_single, single * largest, fine)
+    return found.masked_fill((values == values.round()).all(0), 0.0)
 
 
 def _beside_the_fastest(

@@ -91,12 +91,22 @@ class Environment(ABC):
 
     def check(self) -> None:
         """Raises if a setting of the evaluation is wrong, before data are collected."""
-        for name in ("episodes", "validation_episodes"):
-            number = self.settings.evaluate.get(name, 1)
-            if type(number) is not int or number < 1:
+        settings = self.settings.get("evaluate")
+        if not isinstance(settings, DictConfig):
+            raise ValueError(
+                f"env.evaluate is {settings}, but it should be a group of settings"
+            )
+        for name, least in (
+            ("episodes", 1),
+            ("validation_episodes", 1),
+            ("seed", 0),
+            ("validation_seed", 0),
+        ):
+            number = settings.get(name)
+            if type(number) is not int or number < least:
                 raise ValueError(
                     f"env.evaluate.{name} is {number!r}, expected an integer of at "
-                    "least 1"
+                    f"least {least}"
                 )
 
     @property

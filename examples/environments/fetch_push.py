@@ -74,6 +74,11 @@ class FetchPush(Environment):
         names = ("cube_friction", "cube_speed")
         return {name: settings[name] for name in names if name in settings}
 
+    def check(self) -> None:
+        """Raises if the splits have starts in common."""
+        super().check()
+        self._starts("test")
+
     def collect(self, *, progress: bool = False) -> None:
         """Collects what is missing of the datasets, and selects the transitions."""
         settings, out = self.settings.collect, self.out
@@ -154,6 +159,10 @@ class FetchPush(Environment):
 
     def demonstrations(self) -> TensorDictBase:
         """Returns the demonstrations up to their first success."""
+        if not self.has_demonstrations:
+            raise ValueError(
+                "env.demonstrations is null, so that there are none: set a number"
+            )
         return load_transitions(self.folder / "demonstrations")
 
     @property
@@ -181,21 +190,33 @@ class FetchPush(Environment):
         self, actor: Any, seed: int, folder: Path, *, split: Split = "test"
     ) -> list[dict[str, Any]]:
         """Plays episodes from the same starts for all runs."""
-        settings = self.settings.evaluate
-        numbers = {
-            "test": (settings.episodes, settings.seed),
-            "validation": (settings.validation_episodes, settings.validation_seed),
-        }
-        spans = [range(first, first + number) for number, first in numbers.values()]
-        if set(spans[0]) & set(spans[1]):
-            raise ValueError(
-                f"env.evaluate: the seeds of the validation starts, {spans[1]}, are "
-                f"also some of the test starts, {spans[0]}: change validation_seed"
-            )
-        episodes, first = numbers[split]
+        starts = self._starts(split)
         torch.manual_seed(seed)  # for policies that draw
-        steps = self.settings.collect.steps
-        return play(actor, episodes=episodes, steps=steps, seed=first, **self.cubes)
+        return play(
+            actor,
+            episodes=len(starts),
+            steps=self.settings.collect.steps,
+            seed=starts.start,
+            **self.cubes,
+        )
+
+    def _starts(self, split: Split) -> range:
+        """Returns the seeds of the starts, which the other split does not have."""
+        settings = self.settings.evaluate
+        starts = {
+            "test": range(settings.seed, settings.seed + settings.episodes),
+            "validation": range(
+                settings.validation_seed,
+                settings.validation_seed + settings.validation_episodes,
+            ),
+        }
+        if set(starts["test"]) & set(starts["validation"]):
+            raise ValueError(
+                "env.evaluate: the seeds of the validation starts, "
+                f"{starts['validation']}, are also some of the test starts, "
+                f"{starts['test']}: change validation_seed"
+            )
+        return starts[split]
 
     def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
         """Plays the test episodes again, and returns the first one."""

@@ -188,3 +188,29 @@ def test_what_is_no_state_is_left_out(tmp_path: Path) -> None:
     assert {*np.load(tmp_path / "a.npz")} == names | {"dones", "terminals"}
     back = open_dataset(tmp_path / "a.npz", tmp_path / "back", progress=False)
     assert back["observation"].shape[-1] == 2
+
+
+def test_nested_actions_and_goals_of_one_state_are_kept(tmp_path: Path) -> None:
+    rows = TensorDict(
+        {
+            "observation": torch.rand(4, 2),
+            "action": {"arm": torch.rand(4, 2), "hand": torch.rand(4, 1)},
+            "desired_goal": torch.rand(4, 1),
+            "priority": torch.rand(4, 1),
+            "next": {
+                "observation": torch.rand(4, 2),
+                "achieved_goal": torch.rand(4, 1),
+            },
+        },
+        [4],
+    )
+    rows["displacement", "score"] = torch.rand(4, 2)
+    with np.load(export_npz(rows, tmp_path / "a.npz"), allow_pickle=False) as stored:
+        assert sorted(stored) == [
+            "actions/arm",
+            "actions/hand",
+            "next_observations/achieved_goal",
+            "next_observations/observation",
+            "observations/desired_goal",
+            "observations/observation",
+        ]

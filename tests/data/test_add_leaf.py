@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import json
 import os
 import signal
 
@@ -17,6 +19,7 @@ from torchrl_caiac.data import (
     offline_buffer,
     verify_digests,
 )
+from torchrl_caiac.data.add_leaf import store_leaves
 from torchrl_caiac.influence import score_buffer
 
 
@@ -179,3 +182,30 @@ def test_a_killed_process_adds_a_leaf_as_a_whole_or_not(data, tmp_path):
     again = load_transitions(tmp_path / "rows", verify=True)
     assert "weight" not in again
     assert add_leaf(again, "weight", np.ones(6)).tolist() == [1.0] * 6
+
+
+def test_a_file_that_is_not_listed_is_written_again(tmp_path):
+    """As a process leaves it that is killed after it has written the values."""
+    rows = TensorDict({"action": torch.zeros(3, 2)}, [3])
+    rows.memmap(tmp_path / "rows")
+    data = load_transitions(tmp_path / "rows", keys=["action"])
+    add_leaf(data, "weight", torch.zeros(3))
+    meta = tmp_path / "rows" / "meta.json"
+    listed = json.loads(meta.read_text())
+    del listed["weight"]
+    meta.write_text(json.dumps(listed))
+    data = load_transitions(tmp_path / "rows", keys=["action"]).unlock_()
+    data["weight"] = torch.ones(3)
+    assert store_leaves(data) == ["weight"]
+    again = load_transitions(tmp_path / "rows", keys=["action"])
+    assert (again["weight"] == 1).all()
+
+
+def test_file_systems_without_allocation(tmp_path, monkeypatch):
+    def refuse(*args):
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    TensorDict({"action": torch.zeros(3, 2)}, [3]).memmap(tmp_path / "rows")
+    data = load_transitions(tmp_path / "rows", keys=["action"])
+    assert (add_leaf(data, "weight", torch.ones(3)) == 1).all()

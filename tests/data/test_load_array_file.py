@@ -170,3 +170,12 @@ def test_an_array_beside_a_group_of_its_name(tmp_path):
     np.savez(tmp_path / "a.npz", actions=np.zeros((4, 1)), **names)
     with pytest.raises(ValueError, match="has the array 'observations' and arrays"):
         load_array_file(tmp_path / "a.npz", tmp_path / "data", progress=False)
+
+
+@pytest.mark.parametrize("first", ["observations/cup", "observations/cup/vel"])
+def test_arrays_below_an_array_are_refused(tmp_path, first):
+    arrays = {"observations/cup": np.zeros((4, 2)), "observations/cup/vel": np.ones(4)}
+    arrays = {first: arrays.pop(first), **arrays}
+    np.savez(tmp_path / "a.npz", actions=np.zeros((4, 1)), **arrays)
+    with pytest.raises(ValueError, match="'observations/cup' and arrays below it"):
+        load_array_file(tmp_path / "a.npz", tmp_path / "rows", progress=False)

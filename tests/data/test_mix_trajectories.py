@@ -22,7 +22,7 @@ from torchrl_caiac.data import (
 )
 from torchrl_caiac.data.digests import data_digest, data_source
 from torchrl_caiac.data.write_transitions import write_transitions
-from torchrl_caiac.influence import score_buffer
+from torchrl_caiac.influence import MotionInfluence, score_buffer
 
 
 def source(lengths, *, first_id=0, id_shape=(), seed=0):
@@ -447,6 +447,38 @@ def test_scores_of_other_estimators_are_refused():
     one, same, other = scored(1.0, 0), scored(1.0, 1), scored(100.0, 2)
     mixed = mix_trajectories([one, same], shares=[0.5, 0.5])
     assert ("caiac", "score") in mixed.keys(True, True)
-    with pytest.raises(ValueError, match=r"0 and source 1 .*exclude=\['caiac'\]"):
+    with pytest.raises(ValueError, match=r"0 and source 1 .*exclude=\[\('caiac'"):
         mix_trajectories([one, other], shares=[0.5, 0.5])
     mix_trajectories([one, other], shares=[0.5, 0.5], exclude=["caiac"])
+
+
+@pytest.mark.parametrize("key", ["state", "nested"])
+def test_scores_of_other_estimators_are_told_by_any_state(key):
+    names = {"robot": [0, 1], "cup": [2, 3]}  # not in the order of their names
+    if key == "state":
+        layout = EntityLayout(names, observation_key="state", fixed=["robot"])
+    else:
+        keys = {name: ("observation", name) for name in names}
+        layout = EntityLayout.from_keys(keys, fixed=["robot"])
+
+    def scored(tolerance, seed, waits=0):
+        torch.manual_seed(seed)
+        state = torch.rand(200, 4)
+        state[:waits] = seed
+        after = state + 0.1 * (torch.rand(200, 1) < 0.3)
+        data = source([100, 100], seed=seed).select("episode", "action")
+        for place, value in (((), state), (("next",), after)):
+            if key == "state":
+                data[(*place, "state")] = value
+            else:
+                for name, columns in names.items():
+                    data[(*place, "observation", name)] = value[:, columns].clone()
+        rb = offline_buffer(data, batch_size=8)
+        estimator = MotionInfluence(layout, tolerance)
+        score_buffer(rb, estimator, check=False, progress=False)
+        return rb.storage[:]
+
+    one, same, other = scored(0.05, 0, 120), scored(0.05, 1, 120), scored(0.5, 2)
+    mix_trajectories([one, same])
+    with pytest.raises(ValueError, match=r"exclude=\[\('caiac', 'score'\), "):
+        mix_trajectories([one, other])

@@ -328,3 +328,22 @@ def test_scoring_does_not_change_the_digest(make):
     rows["episode"] += 10
     rb.extend(rows)
     score_buffer(rb, estimator, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (functools.partial(torch.clamp, max=1), functools.partial(torch.clamp, max=2)),
+        (torch.relu, torch.tanh),
+    ],
+)
+def test_partial_and_builtin_functions_of_described_objects(one, other):
+    class Described:
+        def __init__(self, function):
+            self.function = function
+
+        def __repr__(self):
+            return "Described()"
+
+    assert estimator_digest(Described(one)) == estimator_digest(Described(one))
+    assert estimator_digest(Described(one)) != estimator_digest(Described(other))

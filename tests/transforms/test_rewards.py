@@ -375,3 +375,27 @@ def test_her_reward_sets_the_flags_of_the_rows_that_the_buffer_relabelled() -> N
         assert torch.equal(batch["next", "terminated"][:4, 0], expected[:4])
         assert torch.equal(batch["next", "done"][:4, 0], expected[:4])
     assert (rb.storage[:] == stored).all()
+
+
+@pytest.mark.parametrize("path", ["swap", "her"])
+def test_goals_that_are_reached_equal_their_rounded_copies(path: str) -> None:
+    state = torch.linspace(0.1, 0.8, 8, dtype=torch.float64).unsqueeze(-1)
+    td = TensorDict(
+        {
+            "observation": state,
+            "desired_goal": (state + 0.3).float(),
+            "next": {"observation": state + 0.3, "reward": -torch.ones(8, 1)},
+            ("caiac", "score"): torch.ones(8, 1),  # nothing is swapped
+        },
+        [8],
+    )
+
+    def exact(achieved: torch.Tensor, desired: torch.Tensor) -> torch.Tensor:
+        return (achieved == desired).all(-1).float() - 1
+
+    if path == "swap":
+        transform = CAIACTransform(LAYOUT, 0.5, reward_fn=exact, rows="last")
+        reward = transform(td)["next", "reward"][4:]
+    else:
+        reward = HindsightGoal(LAYOUT, exact, future=0.0).her_reward(td)
+    assert (reward == 0).all()

@@ -163,7 +163,6 @@ def augment_dataset(
         write_digests(folder, source=source)
         if bounds is not None:
             write_action_bounds(folder, *bounds)
-        check_free(path, overwrite)  # another process may have been faster
     return load_transitions(Path(path))
 
 

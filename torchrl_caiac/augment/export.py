@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,7 @@ from torchrl_caiac.data.write_transitions import check_free
 
 __all__ = ["export_hdf5", "export_npz"]
 
+_LOGGER = logging.getLogger("torchrl_caiac.augment")
 _CHUNK = 1 << 14  # rows copied at a time
 _NAMES = {
     ("action",): "actions",
@@ -46,7 +48,9 @@ def export_npz(
     ``terminals``, ``timeouts``, ``dones`` and ``episodes``, and of augmented data
     ``counterfactual`` and ``swapped``, all with one entry for each transition. Entries
     of a nested observation, and goals, are ``observations/<name>``; then the
-    observation vector is ``observations/observation``. Read it with ``numpy.load``.
+    observation vector is ``observations/observation``. Nested actions are
+    ``actions/<name>``. The rest, such as scores and ``info``, is left out. Read the
+    file with ``numpy.load``.
 
     Args:
         data (TensorDictBase): the transitions, ``[T]``.
@@ -163,23 +167,32 @@ def export_hdf5(
 def _arrays(data: TensorDictBase) -> Iterator[tuple[str, torch.Tensor]]:
     """Yields the names and tensors of the entries that have a name there."""
     keys = sorted((path_of(key) for key in data.keys(True, True)), key=str)
-    after = {key[1:] for key in keys if key[0] == "next"}
-    # A vector that has no next one is a goal, a number tells something else of a row.
-    root = {key for key in keys if key[0] != "next"}
-    root = {key for key in root if key in after or data.get(key).ndim > 1}
-    keys = [key for key in keys if key in _NAMES or _state(key) in root]
-    states = [key for key in keys if _state(key) is not None]
-    is_vector = all(_state(key) == ("observation",) for key in states)
+    # What both states have, goals and observations; the rest tells of a row.
+    both = {key for key in keys if ("next", *key) in keys}
+    states = {
+        key: state
+        for key in keys
+        if (state := _state(key))
+        and (state in both or state[0] == "observation" or "goal" in state[-1])
+    }
+    is_vector = all(state == ("observation",) for state in states.values())
+    left_out = []
     for key in keys:
-        state = _state(key)
+        state = states.get(key)
         if key in _NAMES:
             leaf = data.get(key)
             is_flag = key[0] == "next" and leaf.shape[1:] == (1,)
             yield _NAMES[key], leaf.squeeze(-1) if is_flag or _is_mark(key) else leaf
-        elif state is not None:
+        elif key[0] == "action":
+            yield "/".join(("actions", *key[1:])), data.get(key)
+        elif state is None:
+            left_out.append(".".join(key))
+        else:
             name = "next_observations" if key[0] == "next" else "observations"
             inner = state[1:] if state[0] == "observation" and state[1:] else state
             yield "/".join((name, *(() if is_vector else inner))), data.get(key)
+    if left_out:
+        _LOGGER.info("%s are left out of the exported arrays", left_out)
 
 
 def _is_mark(key: tuple[str, ...]) -> bool:
@@ -188,11 +201,9 @@ def _is_mark(key: tuple[str, ...]) -> bool:
 
 def _state(key: tuple[str, ...]) -> tuple[str, ...] | None:
     """Returns the key of an entry of the state; ``None`` for others."""
-    if key in _NAMES or key[0] in ("caiac", "info", "hindsight"):
-        return None
-    if key[0] == "next":
-        return None if key[1] in ("info", "caiac", "action") else key[1:]
-    return key
+    state = key[1:] if key[0] == "next" else key
+    none = key in _NAMES or state[0] in ("action", "caiac", "hindsight", "info")
+    return None if none else state
 
 
 def _parts(leaf: torch.Tensor) -> Iterator[NDArray[Any]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -14,7 +13,13 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_caiac._files import recover_meta, reserve, safe_meta, write_json
+from torchrl_caiac._files import (
+    allocate,
+    recover_meta,
+    reserve,
+    safe_meta,
+    write_json,
+)
 from torchrl_caiac._keys import as_key
 from torchrl_caiac._keys import path as path_of
 from torchrl_caiac._torchrl import (
@@ -148,7 +153,8 @@ def store_leaves(data: TensorDictBase) -> list[NestedKey]:
         file = file.with_name(f"{file.name}.memmap")
         if isinstance(leaf, MemoryMappedTensor) and _file_of(leaf) == file:
             continue
-        if leaf.numel() and file.exists():
+        # A process that was killed in add_leaf may have left a file that is not listed.
+        if leaf.numel() and file.exists() and _is_listed(file, key):
             raise ValueError(
                 f"{key!r} of the data opened from {folder} was replaced by another "
                 f"tensor, and {file} has other content: write in place, as in "
@@ -174,6 +180,13 @@ def store_leaves(data: TensorDictBase) -> list[NestedKey]:
     if keys:
         _logger.info("%s, set after unlock_(), are written to %s", keys, folder)
     return keys
+
+
+def _is_listed(file: Path, key: NestedKey) -> bool:
+    meta = file.with_name("meta.json")
+    if not meta.exists():  # nor is the entry above it
+        return False
+    return path_of(key)[-1] in json.loads(meta.read_text(encoding="utf-8"))
 
 
 def _file_of(leaf: MemoryMappedTensor) -> Path | None:
@@ -255,8 +268,7 @@ def _stored(data: TensorDictBase, key: NestedKey, leaf: torch.Tensor) -> torch.T
     with safe_meta(folder):
         # A full disk would kill the process while it writes to mapped memory.
         with naming_full_disk(folder), TemporaryFile(dir=folder) as file:
-            size = leaf.numel() * leaf.element_size()
-            os.posix_fallocate(file.fileno(), 0, max(1, size))
+            allocate(file.fileno(), max(1, leaf.numel() * leaf.element_size()))
         # The values are written first, and then the list of leaves.
         return data.make_memmap_from_tensor(key, leaf.cpu().contiguous())
 

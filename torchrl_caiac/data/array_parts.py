@@ -291,8 +291,9 @@ def episode_parts(episodes: Iterable[ArraySet], lost: LostRows) -> Iterator[Part
     for number, arrays in enumerate(episodes):
         where = f"episode {number}"
         check_arrays(arrays.actions, "actions", where)
-        _check_flags(arrays, where)
-        spans = FlatArrays(arrays, where, [entries(arrays.actions, "actions", where)])
+        steps = entries(arrays.actions, "actions", where)
+        _check_flags(arrays, steps, where)
+        spans = FlatArrays(arrays, where, [steps])
         first = spans.lost if first is None else first
         if spans.lost != first:
             counts = ["one observation for each action", "one observation more"]
@@ -303,12 +304,16 @@ def episode_parts(episodes: Iterable[ArraySet], lost: LostRows) -> Iterator[Part
         yield from spans.parts(lost)
 
 
-def _check_flags(arrays: ArraySet, where: str) -> None:
-    """Raises if a flag of an end is set within the arrays of one episode."""
+def _check_flags(arrays: ArraySet, steps: int, where: str) -> None:
+    """Raises if a flag of an end is set within the arrays of one episode.
+
+    Other errors say what is wrong with arrays of another length, or of other values.
+    """
     for name in ("terminals", "timeouts", "dones"):
         flags = getattr(arrays, name)
-        early = np.zeros(0) if flags is None else np.asarray(flags).reshape(-1)[:-1]
-        if early.dtype.kind in "biuf" and early.any():
+        found = np.zeros(0) if flags is None else np.asarray(flags).reshape(-1)
+        early = found[:-1]
+        if len(found) == steps and np.isin(found, (0, 1)).all() and early.any():
             raise ValueError(
                 f"{name} of {where} is set in row {int(early.argmax())}, before the "
                 "last one, but an episode ends at such a flag: cut it there, or give a "

@@ -198,12 +198,14 @@ class _Archive(Mapping[str, Any]):
             if kind.shape:
                 whole = group if group in _ARGUMENTS else name
                 self._parts.setdefault(whole, []).append(name)
-        for whole, names in self._parts.items():
-            if whole in names and len(names) > 1:
-                raise ValueError(
-                    f"the file has the array {whole!r} and arrays below it, {names}: "
-                    "rename them, or pass the arrays to from_arrays"
-                )
+        for names in self._parts.values():
+            for name in names:
+                below = [other for other in names if other.startswith(f"{name}/")]
+                if below:
+                    raise ValueError(
+                        f"the file has the array {name!r} and arrays below it, "
+                        f"{below}: rename them, or pass the arrays to from_arrays"
+                    )
 
     def __getitem__(self, name: str) -> Any:
         tree: dict[str, Any] = {}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -411,7 +412,7 @@ def _check_scores(
             first, other = known[0]
             if settings != other:
                 scores = (*key[:-1], key[-1].removesuffix("_fingerprint"))
-                names = [key[0]] if len(key) > 1 else [*scores, *key]
+                names = [one[0] if len(one) == 1 else one for one in (scores, key)]
                 raise ValueError(
                     f"{scores} of source {first} and source {number} were computed "
                     "with other settings, such as another estimator: score the mixture "
@@ -419,19 +420,43 @@ def _check_scores(
                 )
 
 
-# Rows of which the settings of scores are compared.
+# Rows of which the settings of scores are compared, evenly spaced.
 _LOOKED_AT = 64
+# Entries of a nested state of which all orders are tried.
+_MOST_ENTRIES = 5
 
 
 def _settings(source: TensorDictBase, key: tuple[str, ...]) -> int | None:
-    """Returns what scores depend on; ``None`` if their states cannot be told."""
-    rows = source[:_LOOKED_AT]
-    state = state_hash(rows, ["observation"])
-    if state is None:
-        return None
-    after = state_hash(rows, [("next", "observation")])
-    found = (settings_of(rows.get(key), state, after) >> 16).unique()
-    return int(found) if len(found) == 1 and len(rows) > 1 else None
+    """Returns what scores depend on; ``None`` if their states cannot be told.
+
+    The layout is not known: a state is one entry, or all entries of a nested one.
+    Fingerprints less the hash of the state are alike in all rows if it is the right
+    one.
+    """
+    count = min(_LOOKED_AT, len(source))
+    rows = source[torch.arange(count) * len(source) // count]
+    known = rows.get(key)
+    for entries in _possible_states(rows):
+        state = state_hash(rows, entries)
+        after = state_hash(rows, [("next", *entry) for entry in entries])
+        if state is None or after is None or len((state + after).unique()) < 4:
+            continue  # where all rows are alike, any state seems to be right
+        found = (settings_of(known, state, after) >> 16).unique()
+        if len(found) == 1:
+            return int(found)
+    return None
+
+
+def _possible_states(rows: TensorDictBase) -> Iterator[Sequence[tuple[str, ...]]]:
+    keys = [key_path(key) for key in rows.keys(True, True)]
+    groups: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for key in keys:
+        if key[0] != "next" and ("next", *key) in keys:
+            yield [key]
+            groups.setdefault(key[:-1], []).append(key)
+    for group in groups.values():
+        if 1 < len(group) <= _MOST_ENTRIES:
+            yield from permutations(group)
 
 
 def _structure(

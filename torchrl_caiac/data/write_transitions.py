@@ -156,7 +156,6 @@ def whole_transitions(
     """
     with whole_folder(path) as folder:
         yield folder
-        check_free(path, overwrite)
         try:
             if keys is None:
                 load_transitions(folder)
@@ -167,6 +166,7 @@ def whole_transitions(
                 f"the data for {path} cannot be opened once they are written "
                 f"({error}); {path} is unchanged: correct the data"
             ) from error
+        check_free(path, overwrite)  # another process may have been faster
 
 
 def write_transitions(

@@ -27,6 +27,8 @@ _LIBRARIES = sys.stdlib_module_names | {"numpy", "scipy", "tensordict", "torch"}
 _LIBRARIES |= {"torchrl"}
 _PLAIN = (str, bytes, int, float, complex, type(None))
 _FUNCTIONS = (types.FunctionType, types.MethodType, functools.partial)
+# Functions that are settings as they are, like models.
+_SETTINGS = (types.FunctionType, types.BuiltinFunctionType, functools.partial)
 _CONTAINERS = (Mapping, list, tuple, Set)
 _MODELS = (nn.Module, torch.Tensor, np.ndarray)
 
@@ -36,8 +38,8 @@ def estimator_digest(estimator: Any) -> str:
 
     Its type, ``repr`` and ``state_dict`` enter the digest. So do its attributes, unless
     its class has a ``__repr__`` (a module: an ``extra_repr``) of its own, which then
-    names the settings. Models and tensors in its attributes always do, with their
-    content, also those inside of containers and other objects. Of a function, the
+    names the settings. Models, tensors and functions in its attributes always do, with
+    their content, also those inside of containers and other objects. Of a function, the
     code, the values that it has bound, and the global models, tensors, functions,
     numbers and texts that it names enter. Attributes that a ``__getstate__`` leaves
     out, such as a simulator, do not.
@@ -209,12 +211,10 @@ class _Contents:
             yield self.digest(_attributes(value), models=_is_described(value))
 
     def _models(self, value: Any) -> Iterator[bytes]:
-        """Yields the models and tensors that the ``repr`` leaves out."""
+        """Yields the models, tensors and functions that the ``repr`` leaves out."""
         if isinstance(value, (*_PLAIN, type, types.ModuleType, EntityLayout)):
             return
-        if isinstance(value, types.FunctionType) or (
-            isinstance(value, _MODELS) or _is_tensordict(value)
-        ):
+        if isinstance(value, (*_SETTINGS, *_MODELS)) or _is_tensordict(value):
             found = self.digest(value)
             if found != b"itself":
                 yield found
@@ -222,8 +222,6 @@ class _Contents:
             inside = value if isinstance(value, _CONTAINERS) else _attributes(value)
             if isinstance(value, types.MethodType):
                 inside = [value.__func__, value.__self__]
-            elif isinstance(value, functools.partial):
-                inside = [value.func, value.args, value.keywords]
             for label, item in self._items(inside):
                 found = self.digest(item, models=True)
                 if found:

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 if TYPE_CHECKING:
-    import torch
     from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["EntityReport", "best_threshold", "influence_report", "roc_auc"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -15,7 +15,13 @@ from torchrl_caiac._layout_units import position_places
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.noise import resting_noise
 
-__all__ = ["FloorFromData", "VarianceFloor", "checked_floor", "layout_floor"]
+__all__ = [
+    "FloorFromData",
+    "FoundFloor",
+    "VarianceFloor",
+    "checked_floor",
+    "layout_floor",
+]
 
 VarianceFloor: TypeAlias = (
     float | Mapping[str, float | Sequence[float]] | Literal["auto"] | None
@@ -24,6 +30,18 @@ VarianceFloor: TypeAlias = (
 _LOGGER = logging.getLogger("torchrl_caiac.fit")
 _DEFAULT_FLOOR = 1e-3  # 1 mm, 1 mrad
 _ROWS = 100_000  # from which the floor is taken
+
+
+class FoundFloor(NamedTuple):
+    """A variance floor that was taken from data.
+
+    Attributes:
+        values (torch.Tensor): float64 ``[P]``, the floor of the predicted columns.
+        reasons (dict of str to str): how the floor of each entity was found.
+    """
+
+    values: torch.Tensor
+    reasons: dict[str, str]
 
 
 class FloorFromData(nn.Module):
@@ -47,9 +65,16 @@ class FloorFromData(nn.Module):
         """Whether the variance floor is known; false before it is taken from data."""
         return not self.auto_floor or bool(self.floor_reasons)
 
-    def entity_floors(self) -> dict[str, list[float]]:
-        """Returns the variance floor of the predicted columns of each entity."""
-        floor = self.floor.tolist()
+    def entity_floors(self, found: FoundFloor | None = None) -> dict[str, list[float]]:
+        """Returns the variance floor of the predicted columns of each entity.
+
+        Args:
+            found (FoundFloor, optional): the floor. Defaults to that of the model.
+
+        Returns:
+            dict of str to list of float: the floor, by entity.
+        """
+        floor = (self.floor if found is None else found.values).tolist()
         return {name: floor[where] for name, where in self.predicted.items()}
 
     def fit_variance_floor(
@@ -92,6 +117,10 @@ class FloorFromData(nn.Module):
             >>> model.floor
             tensor([0.0500], dtype=torch.float64)
         """
+        self.set_floor(self.floor_from(data))
+
+    def floor_from(self, data: TensorDictBase | Sequence[TensorDictBase]) -> FoundFloor:
+        """Returns what :meth:`fit_variance_floor` sets, without setting it."""
         if not self.auto_floor:
             raise ValueError(
                 "the model has a variance floor of its own: create it with "
@@ -106,8 +135,13 @@ class FloorFromData(nn.Module):
             for place in places:
                 each[place] = max(noise[name].floor[p] for p in places)
             floor += [each[p] for p in own]
-        self.floor.copy_(torch.tensor(floor, dtype=torch.float64))
-        self.floor_reasons = {name: noise[name].reason for name in self.predicted}
+        values = torch.tensor(floor, dtype=torch.float64)
+        return FoundFloor(values, {name: noise[name].reason for name in self.predicted})
+
+    def set_floor(self, found: FoundFloor) -> None:
+        """Sets the variance floor, and logs it with its reasons."""
+        self.floor.copy_(found.values)
+        self.floor_reasons = dict(found.reasons)
         for name, where in self.predicted.items():
             own_floor = ", ".join(f"{value:.3g}" for value in self.floor[where])
             _LOGGER.info(

@@ -23,6 +23,7 @@ __all__ = [
     "GoalLeaves",
     "RewardFn",
     "TerminatedFn",
+    "alike",
     "call_reward",
     "goal_vectors",
     "holds",
@@ -73,7 +74,9 @@ def goal_vectors(
     if achieved is None or desired is None:
         what = "next achieved goals" if achieved is None else "desired goals"
         if layout.is_flat:
-            keys = [layout.desired_goal_key, layout.next(layout.achieved_goal_key)]
+            keys = [layout.desired_goal_key]
+            if not layout.achieved:
+                keys.append(layout.next(layout.achieved_goal_key))
         else:
             keys = [key for key in layout.goal.values() if key is not None]
             keys += [layout.next(k) for k in layout.achieved.values() if k is not None]
@@ -83,6 +86,32 @@ def goal_vectors(
             f"reward_fn or terminated_fn is given, but the batch has no {what}: it "
             f"lacks {lacking}. Store them, or correct goal and achieved of the layout"
         )
+    return alike(achieved, desired)
+
+
+def alike(
+    achieved: torch.Tensor, desired: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns goals in one dtype, so that a goal that is reached equals its copy.
+
+    Args:
+        achieved (torch.Tensor): ``[B, G]``.
+        desired (torch.Tensor): ``[B, G]``.
+
+    Returns:
+        tuple of torch.Tensor: achieved goals in the dtype of desired ones, if that
+        holds them, and desired goals.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_caiac.transforms.rewards import alike
+        >>> achieved = torch.tensor([[0.1]], dtype=torch.float64)
+        >>> achieved, desired = alike(achieved, achieved.float())
+        >>> bool(achieved == desired)
+        True
+    """
+    if holds(desired.dtype, achieved.dtype):
+        achieved = achieved.to(desired.dtype)
     return achieved, desired
 
 

@@ -216,6 +216,18 @@ def test_rewards_compare_goals_that_are_rounded_alike() -> None:
 
 
 @pytest.mark.parametrize("kind", ["window", "hindsight"])
+def test_batches_may_lack_what_goals_are_read_from(kind) -> None:
+    def without(td: TensorDict) -> TensorDict:
+        return td.exclude(("next", "observation"))
+
+    if kind == "window":
+        assert "desired_goal" in sampling(kind, without).sample()
+        return
+    with pytest.raises(KeyError, match=r"next.*observation"):  # which rewards need
+        sampling(kind, without).sample()
+
+
+@pytest.mark.parametrize("kind", ["window", "hindsight"])
 def test_a_sample_that_failed_is_not_compared_later(kind) -> None:
     fails = [False] * 9 + [True]
 

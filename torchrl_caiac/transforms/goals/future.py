@@ -170,6 +170,8 @@ class FutureGoal(RandomTransform, SampleUnit):
         drawn = self._pending.__dict__.pop("own", None)
         if drawn is None or sampling_buffer() is None:
             return
+        if any(leaf_of(td, key) is None for key in self.achieved_keys):
+            return  # left out of the batch, which goals are not read from
         td = td.reshape(-1)
         flags = leaf_of(td, self.keys.counterfactual)
         for key, achieved in self.read_goals(td).items():

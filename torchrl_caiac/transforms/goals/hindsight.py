@@ -26,6 +26,7 @@ from torchrl_caiac.transforms.rewards import (
     GoalLeaves,
     RewardFn,
     TerminatedFn,
+    alike,
     holds,
     stored_reward,
 )
@@ -566,7 +567,8 @@ class HindsightGoal(FutureGoal):
         if relabeled is not None:
             relabeled.fill_(True)  # a view of the batch's flag, like all of these rows
         stored = stored_reward(tensordict, self.keys.reward)
-        leaves = self._goal_leaves(tensordict, _vector(achieved), _vector(desired))
+        goals = alike(_vector(achieved), _vector(desired))
+        leaves = self._goal_leaves(tensordict, *goals)
         reward = leaves.pop(self.keys.reward)
         for key, flags in leaves.items():
             tensordict.get(key).copy_(flags)  # views as well
