@@ -199,11 +199,10 @@ def test_every_fills_the_states_between(
     filled_in, count, start = observation.clone(), 0, 0
     after = after.square()
     for n in lengths:
-        final = smoothing > 1 or lookahead > 0
         states = torch.cat([observation[start : start + n], after[start + n - 1 :][:1]])
-        known = list(range(0, n + final, every))
+        known = list(range(0, n + 1, every))
         count += len(known)
-        for k in range(n + final):
+        for k in range(n + 1):
             around = {k // every * every, -(-k // every) * every} & set(known)
             value = states[list(around)].amax(0)
             (filled_in if k < n else after)[start + min(k, n - 1)] = value
@@ -506,3 +505,36 @@ def test_the_last_next_state_is_scored_by_a_part_of_it():
 def test_the_progress_bar_counts_rows(capsys):
     score_buffer(filled(episodes([5, 7])), Read(), 4)
     assert "12/12" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("lookahead", [0, 1])
+def test_the_state_after_the_last_row_is_one_of_every_few(lookahead: int) -> None:
+    class Height:
+        layout = EntityLayout({"cup": [0]})
+        in_keys = ("observation",)
+
+        def __call__(self, td: TensorDict) -> torch.Tensor:
+            return td["observation"]
+
+    state = torch.tensor([0.0, 0, 0, 1, 1, 1, 9]).unsqueeze(-1)
+    data = TensorDict(
+        {
+            "observation": state[:-1],
+            "episode": torch.zeros(6, dtype=torch.int64),
+            "next": {"observation": state[1:]},
+        },
+        [6],
+    )
+    rb = ReplayBuffer(storage=LazyTensorStorage(6), batch_size=2)
+    rb.extend(data)
+    score_buffer(
+        rb,
+        Height(),
+        every=3,
+        lookahead=lookahead,
+        done_key=None,
+        progress=False,
+        check=False,
+    )
+    scores = rb[:]["caiac", "score"].flatten().tolist()
+    assert scores == ([0, 1, 1, 1, 9, 9] if lookahead == 0 else [1, 1, 1, 9, 9, 9])

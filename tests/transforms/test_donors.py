@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 
 import pytest
 import torch
@@ -31,7 +32,7 @@ from torchrl_caiac.influence import score_buffer
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 from torchrl_caiac.transforms import CAIACTransform, WindowGoal
 from torchrl_caiac.transforms import donors as module
-from torchrl_caiac.transforms.donors import eligible_starts
+from torchrl_caiac.transforms.donors import BufferDonors, eligible_starts
 from torchrl_caiac.transforms.draws import draw_buffer_donors
 
 
@@ -504,3 +505,47 @@ def test_donors_of_another_estimator_are_refused() -> None:
     rb.append_transform(CAIACTransform(layout, 0.5, donors=scored(50.0)))
     with pytest.raises(ValueError, match="donors was computed by another estimator"):
         rb.sample()
+
+
+@pytest.mark.parametrize("earlier", [0, 30])  # step by step, and like earlier batches
+def test_nothing_is_written_between_drawing_and_reading(
+    earlier: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layout = EntityLayout({"arm": [0], "cup": [1]}, fixed=["arm"])
+
+    def rows(influence: float) -> TensorDict:
+        state = torch.full((40, 2), influence)
+        return TensorDict(
+            {
+                "observation": state,
+                "episode": torch.zeros(40, dtype=torch.int64),
+                "next": {"observation": state, "done": torch.zeros(40, 1).bool()},
+                ("caiac", "score"): state,
+            },
+            [40],
+        )
+
+    donors = ReplayBuffer(storage=LazyTensorStorage(40), batch_size=8)
+    donors.extend(rows(0.0))
+    rb = ReplayBuffer(storage=LazyTensorStorage(40), batch_size=8)
+    rb.extend(rows(0.0))
+    rb.append_transform(CAIACTransform(layout, 0.5, donors=donors))
+    for _ in range(earlier):
+        rb.sample()
+    writers: list[threading.Thread] = []
+    index = BufferDonors.index
+
+    def and_then_write(self: BufferDonors) -> object:
+        found = index(self)
+        if not writers:
+            writers.append(threading.Thread(target=donors.extend, args=(rows(1.0),)))
+            writers[0].start()
+            writers[0].join(0.2)
+        return found
+
+    monkeypatch.setattr(BufferDonors, "index", and_then_write)
+    out = rb.sample()
+    writers[0].join()
+    assert (donors[:]["observation"] == 1).all()
+    assert out["caiac", "swapped"][:, 1].any()
+    assert (out["observation"] == 0).all()

@@ -99,7 +99,7 @@ class Scorer:
         in_keys = _in_keys(estimator, layout)
         # Whether the state after the last row of a trajectory is scored.
         self._final = reads_state_only(estimator, layout) and (
-            smoothing > 1 or lookahead > 0
+            smoothing > 1 or lookahead > 0 or every > 1
         )
         layout.check(data[:1], next=self._final)
         self._states = _select(data, in_keys)

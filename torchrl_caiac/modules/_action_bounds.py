@@ -50,9 +50,9 @@ def spec_bounds(spec: Any, size: int) -> tuple[torch.Tensor, torch.Tensor]:
     """
     if not isinstance(spec, Bounded):
         raise TypeError(
-            f"action_spec must be a torchrl Bounded spec, got {type(spec).__name__}: "
-            "world models read continuous actions. For discrete ones use "
-            "MotionInfluence or ResidualInfluence"
+            f"action_spec must be a torchrl Bounded spec, got {type(spec).__name__}. "
+            f"Continuous actions from low to high have Bounded(low, high, ({size},)); "
+            "for discrete ones use MotionInfluence or ResidualInfluence"
         )
     if tuple(spec.shape) != (size,):
         raise ValueError(

@@ -33,7 +33,7 @@ from torchrl_caiac.transforms.checks import (
     check_window,
     check_windows,
 )
-from torchrl_caiac.transforms.donors import BufferDonors
+from torchrl_caiac.transforms.donors import BufferDonors, unchanged_donors
 from torchrl_caiac.transforms.draws import SwapDraw, draw_batch_donors, draw_windows
 from torchrl_caiac.transforms.free_share import FreeShare
 from torchrl_caiac.transforms.goals.window import WindowGoal
@@ -446,8 +446,6 @@ class CounterfactualTransform(RandomTransform, ABC):
         out.set(self.keys.swapped, swapped)
         return out
 
-    # --- the transform ---------------------------------------------------------------
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Makes rows of a batch counterfactual.
 
@@ -473,17 +471,18 @@ class CounterfactualTransform(RandomTransform, ABC):
         shape = tensordict.batch_size
         repeated = self._repeated  # which another thread may replace
         if repeated is not None and repeated.settings == self._settings:
-            done = repeated(
-                tensordict,
-                partial(self._swappable_in, tensordict),
-                self.num_counterfactual(shape[:1].numel() // self.window),
-                rows=self.chosen_rows,
-                swap_prob=self.swap_prob,
-                no_donor=self._no_donor,
-                generator=self.generator,
-                batch_check=self._batch_check,
-                donors=next(iter(self._donors), None),
-            )
+            with unchanged_donors(self._donors):
+                done = repeated(
+                    tensordict,
+                    partial(self._swappable_in, tensordict),
+                    self.num_counterfactual(shape[:1].numel() // self.window),
+                    rows=self.chosen_rows,
+                    swap_prob=self.swap_prob,
+                    no_donor=self._no_donor,
+                    generator=self.generator,
+                    batch_check=self._batch_check,
+                    donors=next(iter(self._donors), None),
+                )
             if done is not None:
                 return done
         if len(shape) != 1:
@@ -505,10 +504,11 @@ class CounterfactualTransform(RandomTransform, ABC):
         if not self._free_share.is_done:
             free = self.swappable(scores)
             self._free_share.add(free, self._thresholds.expected)
-        draw = self._draw(scores)
-        if self.check and self._donors:
-            draw = self._donors[0].verified(draw)
-        out = self._swap(tensordict, plan, values, draw)
+        with unchanged_donors(self._donors):
+            draw = self._draw(scores)
+            if self.check and self._donors:
+                draw = self._donors[0].verified(draw)
+            out = self._swap(tensordict, plan, values, draw)
         if checked is not None:
             self._batch_check.after(out, checked, plan.states)
             if checked.unscored is not None:

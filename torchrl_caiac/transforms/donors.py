@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -25,6 +26,7 @@ from torchrl_caiac._torchrl import (
     sampling_buffer,
     storage_revision,
     storage_rows,
+    writes_paused,
 )
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
@@ -39,19 +41,41 @@ from torchrl_caiac.transforms.draws import (
 )
 from torchrl_caiac.transforms.indexing import plain_tensor
 from torchrl_caiac.transforms.keys import TransformKeys
-from torchrl_caiac.transforms.lookahead import Lookahead, hold_entities
+from torchrl_caiac.transforms.lookahead import BUILDING, Lookahead, hold_entities
 from torchrl_caiac.transforms.swap import SwapLeaf, SwapPlan, apply_swap
 from torchrl_caiac.transforms.thresholds import EntityThresholds
 
 if TYPE_CHECKING:
     from torchrl_caiac.transforms.goals.window import WindowGoal
 
-__all__ = ["BufferDonors", "eligible_starts", "scan_donors"]
+__all__ = ["BufferDonors", "eligible_starts", "scan_donors", "unchanged_donors"]
 
 # Rows of the storage that are read together while an index is built.
 _CHUNK = 1 << 17
 # The most rows of an index as numbers: 128 MiB.
 _MOST_LISTED = 1 << 25
+
+
+@contextmanager
+def unchanged_donors(donors: Sequence[BufferDonors]) -> Iterator[None]:
+    """Has other threads and processes wait before they write to the donors.
+
+    Donors are drawn by an index of what the storage has, and read afterwards.
+
+    Args:
+        donors (sequence of BufferDonors): the donors, if they are of a buffer.
+
+    Examples:
+        >>> from torchrl_caiac.transforms.donors import unchanged_donors
+        >>> with unchanged_donors([]):
+        ...     pass
+    """
+    if not donors or torch.compiler.is_compiling():
+        yield
+        return
+    # Always in this order, in which the lookahead takes them too.
+    with BUILDING, writes_paused(donors[0].donors):
+        yield
 
 
 def scan_donors(

@@ -43,6 +43,7 @@ from torchrl_caiac.transforms.indexing import pick_rows
 from torchrl_caiac.transforms.keys import TransformKeys
 
 __all__ = [
+    "BUILDING",
     "NEVER",
     "Lookahead",
     "LookaheadArgument",
@@ -63,7 +64,7 @@ _MOST = torch.iinfo(torch.int16).max - 1
 # Scores that are compared with the threshold together.
 _CHUNK = 1 << 20
 # Batches may be prefetched by several threads. It is taken before the buffer's lock.
-_BUILDING = ThreadLock()
+BUILDING = ThreadLock()
 
 
 def check_lookahead(lookahead: object) -> LookaheadArgument:
@@ -297,7 +298,7 @@ class Lookahead:
             TypeError: the storage does not contain a tensordict.
             ValueError: the scores look further ahead than the rule.
         """
-        with _BUILDING, writes_paused(source):
+        with BUILDING, writes_paused(source):
             return self._table(source).clone()
 
     def _table(self, source: ReplayBuffer | TensorStorage) -> torch.Tensor:
@@ -472,7 +473,7 @@ class Lookahead:
                 "trajectories of its rows are unknown: append this transform before "
                 "others that select, repeat or reorder rows, or leave out lookahead"
             )
-        with _BUILDING, writes_paused(source):  # no write between table and rows
+        with BUILDING, writes_paused(source):  # no write between table and rows
             found = pick_rows(self._table(source), rows).to(device)
             keys = own if self.keys.trajectory is None else (*own, self.keys.trajectory)
             replaced = _differing(batch, storage_rows(storage), keys, rows)
