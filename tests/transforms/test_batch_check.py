@@ -33,7 +33,8 @@ from tests.transforms.oracle import (
 )
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac._fingerprints import fingerprint_key
-from torchrl_caiac.influence import score_buffer
+from torchrl_caiac.data import offline_buffer
+from torchrl_caiac.influence import MotionInfluence, score_buffer
 from torchrl_caiac.transforms import TransformKeys
 from torchrl_caiac.transforms.checks import LateCheck
 
@@ -610,3 +611,45 @@ def test_late_errors_of_scores() -> None:
     with pytest.raises(ValueError, match=r"\['fingerprints'\] were invalid in an earl"):
         transform(good)
     transform(good)
+
+
+@pytest.mark.parametrize("kind", ["flat", "nested"])
+@pytest.mark.parametrize("where", ["memory", "memmap"])
+def test_scores_of_a_layout_that_was_corrected_are_refused(kind, where, tmp_path):
+    columns = {"hand": [0, 1], "cup": [2, 3], "jug": [4, 5]}
+    exchanged = {**columns, "cup": columns["jug"], "jug": columns["cup"]}
+    fewer = {**columns, "cup": columns["cup"][:1]}  # such as positions alone
+
+    def layout(named):
+        if kind == "flat":
+            return EntityLayout(named, fixed=["hand"])
+        keys = {name: ("observation", f"at{c[0]}") for name, c in named.items()}
+        return EntityLayout.from_keys(keys, fixed=["hand"])
+
+    state = torch.rand(64, 6)
+    data = TensorDict({"episode": torch.arange(64)}, [64])
+    for place, value in (((), state), (("next",), state + 0.1)):
+        if kind == "flat":
+            data[(*place, "observation")] = value
+        else:
+            for c in columns.values():
+                data[(*place, "observation", f"at{c[0]}")] = value[:, c].clone()
+    data["next", "done"] = torch.ones(64, 1, dtype=torch.bool)
+
+    def scored(named):
+        rows = data.clone()
+        if where == "memmap":
+            rows = rows.memmap(tmp_path / str(len(list(tmp_path.iterdir()))))
+        rb = offline_buffer(rows, batch_size=16)
+        estimator = MotionInfluence(layout(named), 1.0)
+        score_buffer(rb, estimator, progress=False, check=False)
+        return rb
+
+    for named in (columns, fewer):
+        rb = scored(named)
+        rb.append_transform(CAIACTransform(layout(columns)))
+        rb.sample()
+    rb = scored(exchanged)
+    rb.append_transform(CAIACTransform(layout(columns)))
+    with pytest.raises(ValueError, match="is of 'jug', but the layout here says 'cup'"):
+        rb.sample()

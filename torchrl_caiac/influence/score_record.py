@@ -18,6 +18,7 @@ from torchrl_caiac._torchrl import memmap_folder
 from torchrl_caiac.entities import EntityLayout
 
 __all__ = [
+    "check_owners",
     "layout_digest",
     "read_record",
     "score_file",
@@ -128,6 +129,7 @@ def write_record(
         "state": state,
         "key": jsonable(key),
         "entities": list(layout.names),
+        "features": layout.to_dict()["entities"],
         "fingerprint": _sha(json.dumps(settings, sort_keys=True)),
         "settings": settings,
         "linear_kernels": kernels,
@@ -138,6 +140,51 @@ def write_record(
         storage.caiac_scores = {**records, key: record}
     else:
         write_json(score_file(folder, key), record)
+
+
+def check_owners(record: dict[str, Any], layout: EntityLayout, key: NestedKey) -> None:
+    """Raises if scores are those of a layout that gives a feature to another entity.
+
+    Args:
+        record (dict): the record of the scores.
+        layout (EntityLayout): the entities of those who use them.
+        key (NestedKey): the score leaf, for the error.
+
+    Raises:
+        ValueError: they are.
+
+    Examples:
+        >>> from torchrl_caiac import EntityLayout
+        >>> from torchrl_caiac.influence.score_record import check_owners
+        >>> record = {"features": [["cup", [0]], ["jug", [1]]]}
+        >>> check_owners(record, EntityLayout({"cup": [1], "jug": [0]}), "score")
+        Traceback (most recent call last):
+        ...
+        ValueError: 'score' was computed with a layout in which column 1 is of 'jug'...
+    """
+    then = _owners(record.get("features", []))  # earlier records have none
+    for feature, name in _owners(layout.to_dict()["entities"]).items():
+        before = then.get(feature, name)
+        if before != name:
+            raise ValueError(
+                f"{key!r} was computed with a layout in which {feature} is of "
+                f"{before!r}, but the layout here says {name!r}: score again with it, "
+                "score_buffer(..., overwrite=True), or use the layout of the estimator"
+            )
+
+
+def _owners(entities: list[Any]) -> dict[str, str]:
+    """Returns the entity of each column, or of each key."""
+    return {
+        f"column {one}" if isinstance(one, int) else repr(one): name
+        for name, features in entities
+        for one in _features(features)
+    }
+
+
+def _features(value: Any) -> list[Any]:
+    is_columns = isinstance(value, list) and all(isinstance(x, int) for x in value)
+    return value if is_columns else [value]
 
 
 def settings_that_differ(before: dict[str, Any], now: dict[str, Any]) -> str:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torchrl.data import TensorStorage
 
 from torchrl_caiac._fingerprints import (
     fingerprint_key,
@@ -20,8 +22,9 @@ from torchrl_caiac._fingerprints import (
 )
 from torchrl_caiac._keys import missing_key
 from torchrl_caiac._sampling import all_finite, is_native
-from torchrl_caiac._torchrl import leaf_of
+from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
 from torchrl_caiac.entities import EntityLayout
+from torchrl_caiac.influence.score_record import check_owners, read_record
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flags
 from torchrl_caiac.transforms.checks import LateCheck, LateValue
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -98,6 +101,7 @@ class BatchCheck:
         self._keys = layout.in_keys
         self._next_keys = [layout.next(key) for key in layout.in_keys]
         self._late = LateCheck()
+        self._seen: Any = None  # the storage whose record was compared
 
     def before(self, td: TensorDictBase, scores: torch.Tensor) -> CheckedScores:
         """Checks a batch before it is swapped.
@@ -111,9 +115,10 @@ class BatchCheck:
 
         Raises:
             KeyError: windows have neither trajectory ids nor end flags.
-            ValueError: a score is missing, infinite or that of another state; or the
-                rows of a window do not follow each other.
+            ValueError: a score is missing, infinite or that of another state or layout;
+                or the rows of a window do not follow each other.
         """
+        self._check_layout()
         known = leaf_of(td, self._fingerprint_key)
         is_valid = crosses = None
         if self.window == 1:
@@ -226,6 +231,23 @@ class BatchCheck:
                 f"{self.score_key!r} is infinite for {self._entities(infinite)}: check "
                 "the influence measure, then call score_buffer(..., overwrite=True)"
             )
+
+    def _check_layout(self) -> None:
+        """Compares the layout with that of the scores, once for each storage."""
+        buffer = sampling_buffer()
+        storage = None if buffer is None else buffer.storage
+        if not isinstance(storage, TensorStorage):
+            return
+        if self._seen is not None and self._seen() is storage:
+            return
+        data = storage_rows(storage, "the buffer")
+        record = read_record(storage, data, self.score_key)
+        if record is not None:
+            check_owners(record, self.layout, self.score_key)
+        self._seen = weakref.ref(storage)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_seen": None}
 
     def _explain_fingerprints(self, is_valid: torch.Tensor) -> None:
         rows = int((~is_valid).sum())
