@@ -508,6 +508,14 @@ def test_policies_to_validate(configure, steps):
         ("kitchen", "bc", "env.evaluate.tasks=[kettl]", r"tasks is \['kettl'\]"),
         ("kitchen", "bc", "env.evaluate.tasks=[]", r"tasks is \[\], expected some"),
         ("kitchen", "bc", "env.evaluate.validation_seed=5", "raise env.evaluate"),
+        (
+            "fetch_push",
+            "bc",
+            "env.evaluate.validation_seed=1000050",
+            "also some of the",
+        ),
+        ("fetch_push", "bc", "env.evaluate=3", "env.evaluate is 3, .* a group"),
+        ("kitchen", "bc", "env.evaluate.seed=null", "integer of at least 0"),
         ("fetch_push", "bc", "env.augmentation.threshold=auto", "threshold is 'auto'"),
     ],
 )
