@@ -27,7 +27,7 @@ from tests.influence.scoring import (
     square,
 )
 from torchrl_caiac import EntityLayout
-from torchrl_caiac.data import load_transitions
+from torchrl_caiac.data import UnreadableFileError, load_transitions
 from torchrl_caiac.influence import (
     CAI,
     score_buffer,
@@ -164,3 +164,13 @@ def test_rejects_a_bad_score_file(text, match, tmp_path):
 
 def test_the_score_file_is_named_after_the_key():
     assert score_file("x", ("coda", "graph")) == Path("x/coda.graph.json")
+
+
+@pytest.mark.parametrize("features", ["cup", [["cup"]], [3]])
+def test_a_record_with_damaged_features_is_refused(features, tmp_path):
+    rb = filled(episodes([5]), "memmap", tmp_path=tmp_path)
+    score_buffer(rb, Read(), progress=False)
+    (file,) = tmp_path.rglob("*score.json")
+    file.write_text(json.dumps({**json.loads(file.read_text()), "features": features}))
+    with pytest.raises(UnreadableFileError, match="incomplete"):
+        score_buffer(rb, Read(), progress=False)

@@ -91,8 +91,12 @@ def read_record(
             f"the score file {file} has version {record.get('version')!r}, this "
             f"package reads {_VERSION}: update torchrl_caiac, or {remedy}"
         )
-    if record.get("state") not in _STATES or not isinstance(
-        record.get("settings"), dict
+    pairs = record.get("features", [])  # earlier files have none
+    if (
+        record.get("state") not in _STATES
+        or not isinstance(record.get("settings"), dict)
+        or not isinstance(pairs, list)
+        or not all(isinstance(p, list) and len(p) == 2 for p in pairs)
     ):
         raise UnreadableFileError(f"the score file {file} is incomplete: {remedy}")
     try:
@@ -162,7 +166,7 @@ def check_owners(record: dict[str, Any], layout: EntityLayout, key: NestedKey) -
         ...
         ValueError: 'score' was computed with a layout in which column 1 is of 'jug'...
     """
-    then = _owners(record.get("features", []))  # earlier records have none
+    then = _owners(record.get("features", []))
     for feature, name in _owners(layout.to_dict()["entities"]).items():
         before = then.get(feature, name)
         if before != name:
