@@ -102,7 +102,9 @@ class Environment(ABC):
             ("seed", 0),
             ("validation_seed", 0),
         ):
-            number = settings.get(name)
+            if name not in settings:  # an environment may do without
+                continue
+            number = settings[name]
             if type(number) is not int or number < least:
                 raise ValueError(
                     f"env.evaluate.{name} is {number!r}, expected an integer of at "

@@ -42,7 +42,8 @@ class Oracle:
 
     in_keys = ("observation", "desired_goal")
 
-    def __init__(self):
+    def __init__(self, scale=1):
+        self.scale = scale
         env = make_ogbench_env("cube-double")
         self.bounds = SimpleNamespace(
             unwrapped=SimpleNamespace(
@@ -61,8 +62,7 @@ class Oracle:
             np.random.seed(0)  # where it moves when it is done
         rows = zip(td["observation"].double().numpy(), td["desired_goal"], strict=True)
         actions = [self.act(i, *row) for i, row in enumerate(rows)]
-        # Beyond the bounds, as a policy may be.
-        actions = torch.from_numpy(np.stack(actions)).float() * 10
+        actions = torch.from_numpy(np.stack(actions)).float() * self.scale
         return TensorDict({"action": actions}, td.batch_size)
 
     def act(self, i, state, goal):
@@ -259,6 +259,13 @@ def test_ogbenchs_oracle_solves_tasks(steps, compose, tmp_path):
     for again in (environment, steps.parts.make_environment(cfg)):
         again.settings.evaluate.tasks = [1]
         assert again.play(Oracle(), 1, tmp_path) == episodes[:2]
+
+
+def test_actions_beyond_the_bounds_are_clipped(steps, compose, tmp_path):
+    cfg = compose("env=ogbench_cube_double_play", out=tmp_path)
+    cfg = changed(cfg, evaluate={"tasks": [1]})
+    environment = steps.parts.make_environment(cfg)
+    assert all(e["success"] for e in environment.play(Oracle(scale=10), 0, tmp_path))
 
 
 def test_episodes_that_reach_no_goal_end(steps, compose, tmp_path):
