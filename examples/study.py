@@ -322,7 +322,11 @@ def run_study(options: Options, console: Console) -> None:
     needed = preparations(missing)
     console.stages = {0: 1, 1: 5}.get(len(needed), 3)
     if len(needed) == 1:
-        prepare(needed[0], console)
+        torch.set_num_threads(max(1, options.processes))  # nothing else runs
+        try:
+            prepare(needed[0], console)
+        finally:
+            torch.set_num_threads(1)
     elif needed:
         with console.stage(f"preparation of {len(needed)} settings"):
             jobs = [(cfg,) for cfg in needed]
