@@ -73,8 +73,9 @@ reproduce: setup ## run what is missing of a study (STUDY=kitchen_ratio, QUICK=1
 figures: setup ## draw the results of all studies again
 	$(BIN)/python examples/figures.py
 
-watch: setup ## film two agents of a study side by side (STUDY=demo)
-	@$(BIN)/python examples/watch.py study=$(or $(STUDY),demo) $(SIZE)
+watch: setup ## film two agents of a study side by side (STUDY=demo EPISODE=0)
+	@$(BIN)/python examples/watch.py study=$(or $(STUDY),demo) \
+	    episode=$(or $(EPISODE),0) $(SIZE)
 
 online: setup ## train offline, then collect and train in turn (QUICK=1)
 	@$(BIN)/python examples/online.py $(if $(QUICK),size=quick online.rounds=1 \

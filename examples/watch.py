@@ -1,13 +1,14 @@
 """Films two agents of a study side by side: one with counterfactuals, one without.
 
 ``python watch.py study=demo`` writes ``<root>/studies/demo/watch.gif``, and ``.mp4`` if
-FFmpeg is there. Both sides show the first test start of the study's task, whatever
-comes of it, with the policies whose test results the study reports.
+FFmpeg is there. Both sides show the same test start of the study's task, whatever comes
+of it, with the policies whose test results the study reports.
 
 Further arguments:
 
 - ``methods``: the two sides, ``[none,caiac]`` by default
 - ``task``: another task; by default that of the study's answer, or the first one
+- ``episode``: which test start of the task, from 0; by default 0
 - ``settings``, ``learners``, ``seeds``: of the run, by default the first that has both
 - ``root``, ``size=quick``: as for ``study.py``
 """
@@ -42,15 +43,25 @@ _MOVING, _STILL = 86, 12  # frames at most, then the last one again: 8 seconds
 _MAX_BYTES = 3_000_000
 
 
-def read_watch_arguments(arguments: Sequence[str]) -> tuple[Options, str | None]:
-    """Returns the arguments of ``study.py`` with two methods, and the task.
+def read_watch_arguments(
+    arguments: Sequence[str],
+) -> tuple[Options, str | None, int]:
+    """Returns the arguments of ``study.py`` with two methods, the task, the episode.
 
     Raises:
         ValueError: an argument is not known or has a wrong value.
         FileNotFoundError: there is no such study.
     """
-    tasks = [a for a in arguments if a.startswith("task=")]
-    rest = [a for a in arguments if a not in tasks]
+    own = {"task": "", "episode": "0"}
+    rest = []
+    for argument in arguments:
+        name, _, value = argument.partition("=")
+        if name in own:
+            own[name] = value
+        else:
+            rest.append(argument)
+    if not own["episode"].isdecimal():
+        raise ValueError(f"episode is {own['episode']!r}, expected a number from 0")
     if not any(a.startswith("study=") for a in rest):
         raise ValueError("study=NAME is missing, for example study=demo")
     if not any(a.startswith("methods=") for a in rest):
@@ -60,8 +71,8 @@ def read_watch_arguments(arguments: Sequence[str]) -> tuple[Options, str | None]
         raise ValueError(
             f"methods are {options.only['methods']}, expected two, one for each side"
         )
-    task = tasks[-1].partition("=")[2] if tasks else options.study.answer.task
-    return options, task or None
+    task = own["task"] or options.study.answer.task or None
+    return options, task, int(own["episode"])
 
 
 def pair(options: Options) -> list[Run]:
@@ -84,7 +95,7 @@ def pair(options: Options) -> list[Run]:
     )
 
 
-def record(run: Run, task: str | None) -> Recording:
+def record(run: Run, task: str | None, episode: int = 0) -> Recording:
     """Returns an episode of the policy whose test results are reported.
 
     Raises:
@@ -99,7 +110,7 @@ def record(run: Run, task: str | None) -> Recording:
         )
     *_, test = evaluate(run.cfg, run.method, run.seed)
     actor = load_policy(run.cfg, run.method, run.seed, test.step)
-    return make_environment(run.cfg).record(actor, run.seed, task)
+    return make_environment(run.cfg).record(actor, run.seed, task, episode=episode)
 
 
 def film(recordings: Sequence[Recording], labels: Sequence[str]) -> list[Image.Image]:
@@ -200,11 +211,11 @@ def write_mp4(path: Path, images: Sequence[Image.Image]) -> str | None:
     return None
 
 
-def watch(options: Options, task: str | None, console: Console) -> None:
+def watch(options: Options, task: str | None, episode: int, console: Console) -> None:
     """Films two runs, and prints the files."""
     runs = pair(options)
     with console.stage("episodes"):
-        recordings = [record(run, task) for run in runs]
+        recordings = [record(run, task, episode) for run in runs]
     labels = []
     for run in runs:
         method = make_method(run.cfg, run.method)
@@ -218,15 +229,15 @@ def watch(options: Options, task: str | None, console: Console) -> None:
     if missing:
         console.print(f"left out: {files.pop()} ({missing})")
     console.print(
-        f"the first test start of seed {runs[0].seed}: {', '.join(map(str, files))}"
+        f"test start {episode} of seed {runs[0].seed}: {', '.join(map(str, files))}"
     )
 
 
 def main(arguments: Sequence[str]) -> None:
     """Films two agents of the study of the arguments."""
-    options, task = read_watch_arguments(arguments)
+    options, task, episode = read_watch_arguments(arguments)
     with Console(options.folder, stages=3) as console:
-        watch(options, task, console)
+        watch(options, task, episode, console)
 
 
 if __name__ == "__main__":

@@ -183,8 +183,10 @@ class Environment(ABC):
             list of dict: one dictionary for each episode, JSON values.
         """
 
-    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
-        """Plays the test episodes of a task again, and returns the first one.
+    def record(
+        self, actor: Any, seed: int, task: str | None = None, *, episode: int = 0
+    ) -> Recording:
+        """Plays the test episodes of a task again, and returns one.
 
         Args:
             actor (TensorDictModule): the policy.
@@ -192,8 +194,14 @@ class Environment(ABC):
             task (str, optional): one of the tasks that are evaluated. Defaults to
                 ``None``: the first.
 
+        Keyword Args:
+            episode (int): from 0, among those of the task. Defaults to 0.
+
         Returns:
             Recording: the episode.
+
+        Raises:
+            ValueError: there is no such task or episode.
         """
         raise NotImplementedError(f"{type(self).__name__} records no episodes")
 

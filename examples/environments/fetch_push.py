@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 
 from environments.base import Environment
-from environments.playing import Recording, Split, play_together
+from environments.playing import Recording, Split, check_episode, play_together
 from shared.settings import keep_settings
 from torchrl_caiac.data import (
     load_minari,
@@ -218,11 +218,14 @@ class FetchPush(Environment):
             )
         return starts[split]
 
-    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
-        """Plays the test episodes again, and returns the first one."""
+    def record(
+        self, actor: Any, seed: int, task: str | None = None, *, episode: int = 0
+    ) -> Recording:
+        """Plays the test episodes again, and returns one."""
         if task not in (None, TASK):
             raise ValueError(f"task is {task!r}, expected {TASK!r}")
         settings = self.settings.evaluate
+        check_episode(episode, settings.episodes)
         watched = FetchPushCubes(2, render_mode="rgb_array", **self.cubes)
         states: list[np.ndarray] = []
         torch.manual_seed(seed)
@@ -231,11 +234,11 @@ class FetchPush(Environment):
             episodes=settings.episodes,
             steps=self.settings.collect.steps,
             seed=settings.seed,
-            states=states,
+            recorded=(episode, states),
             **self.cubes,
         )
-        watched.reset(seed=settings.seed)  # the goals of the first episode
-        success, render = episodes[0]["full"], watched.render_states
+        watched.reset(seed=settings.seed + episode)  # its goals
+        success, render = episodes[episode]["full"], watched.render_states
         return Recording(TASK, np.stack(states), render, success, watched.dt)
 
     def measures(self, episodes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -257,13 +260,13 @@ def play(
     episodes: int,
     steps: int,
     seed: int,
-    states: list[np.ndarray] | None = None,
+    recorded: tuple[int, list[np.ndarray]] | None = None,
     **cubes: float,
 ) -> list[dict[str, bool]]:
     """Plays episodes in parallel, from the starts that the seed determines.
 
-    An episode ends as soon as all cubes are at their goals. ``states`` are filled with
-    those of the simulator in the first one.
+    An episode ends as soon as all cubes are at their goals. ``recorded`` is the number
+    of one, and a list to which its states of the simulator are added.
 
     Returns:
         list of dict: for each episode whether all cubes were at their goals at some
@@ -278,13 +281,13 @@ def play(
         state, _, terminated, truncated, info = envs[number].step(action)
         reached[number] |= info["cube_success"]
         full[number] = info["cube_success"].all()
-        if states is not None and number == 0:
-            states.append(envs[0].simulator_state())
+        if recorded is not None and number == recorded[0]:
+            recorded[1].append(envs[number].simulator_state())
         return state, bool(full[number] or terminated or truncated)
 
     starts = [env.reset(seed=seed + number)[0] for number, env in enumerate(envs)]
-    if states is not None:
-        states.append(envs[0].simulator_state())
+    if recorded is not None:
+        recorded[1].append(envs[recorded[0]].simulator_state())
     play_together(actor, starts, step)
     for env in envs:
         env.close()

@@ -14,7 +14,7 @@ from minari import MinariDataset
 from tensordict import TensorDict, TensorDictBase
 
 from environments.base import Environment
-from environments.playing import Recording, Split, play_together
+from environments.playing import Recording, Split, check_episode, play_together
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.data import load_transitions
 from torchrl_caiac.envs import RenderingUnavailable
@@ -184,17 +184,21 @@ class Kitchen(Environment):
             close(kitchens)
         return episodes
 
-    def record(self, actor: Any, seed: int, task: str | None = None) -> Recording:
-        """Plays the test episodes of a task again, and returns the first one."""
+    def record(
+        self, actor: Any, seed: int, task: str | None = None, *, episode: int = 0
+    ) -> Recording:
+        """Plays the test episodes of a task again, and returns one."""
         settings = self.settings.evaluate
         task = settings.tasks[0] if task is None else task
         if task not in settings.tasks:
             raise ValueError(f"task is {task!r}, expected one of {settings.tasks}")
         seeds = self.start_seeds(seed, "test")
+        check_episode(episode, len(seeds))
         kitchens = [KitchenEnv() for _ in seeds]
         try:
             torch.manual_seed(seeds[0])
-            result, states = play_task(actor, kitchens, task, settings.start, seeds)[0]
+            episodes = play_task(actor, kitchens, task, settings.start, seeds)
+            result, states = episodes[episode]
             success, seconds = result["success"], kitchens[0].dt
             return Recording(task, states, render, success, seconds)
         finally:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-__all__ = ["Recording", "Split", "play_together"]
+__all__ = ["Recording", "Split", "check_episode", "play_together"]
 
 Split: TypeAlias = Literal["validation", "test"]
 """The starts that choose a training step, and those that are reported."""
@@ -33,6 +33,15 @@ class Recording(NamedTuple):
     render: Callable[[np.ndarray], np.ndarray]
     success: bool
     seconds: float
+
+
+def check_episode(episode: int, number: int) -> None:
+    """Raises ValueError if there is no such test episode among a number of them."""
+    if not 0 <= episode < number:
+        raise ValueError(
+            f"episode is {episode}, expected 0 to {number - 1}: so many test episodes "
+            "of a task are played"
+        )
 
 
 def play_together(

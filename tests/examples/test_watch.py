@@ -81,9 +81,7 @@ def test_a_missing_ffmpeg_is_told(watch, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["kitchen_all_tasks", "fetch_push"])
-def test_recordings_are_the_first_test_episode(
-    name, steps, compose, tmp_path, monkeypatch
-):
+def test_recordings_are_a_test_episode(name, steps, compose, tmp_path, monkeypatch):
     short = functools.partial(KitchenEnv, max_episode_steps=30)
     monkeypatch.setattr("environments.kitchen.KitchenEnv", short)
     cfg = compose(f"env={name}")
@@ -97,6 +95,11 @@ def test_recordings_are_the_first_test_episode(
         assert len(recording.states) == cfg.env.collect.steps + 1
     else:
         assert len(recording.states) == episodes[0]["steps"] + 1
+    second = environment.record(Waving(), 3, episode=1)
+    assert second.success == episodes[1][environment.success_key]
+    assert (second.states[0] != recording.states[0]).any()
+    with pytest.raises(ValueError, match="episode is 2, expected 0 to 1"):
+        environment.record(Waving(), 3, episode=2)
     frames = recording.render(recording.states[[0, -1]])
     assert frames.shape == (2, 240, 320, 3)
     assert (frames[0] != frames[1]).any()
@@ -105,8 +108,9 @@ def test_recordings_are_the_first_test_episode(
 
 
 def test_the_sides_differ_in_the_method_alone(watch, tmp_path):
-    options, task = watch.read_watch_arguments(["study=demo", f"root={tmp_path}"])
-    assert task == "microwave"
+    arguments = ["study=demo", f"root={tmp_path}"]
+    options, task, episode = watch.read_watch_arguments(arguments)
+    assert (task, episode) == ("microwave", 0)
     left, right = watch.pair(options)
     assert (left.method, right.method) == ("none", "caiac")
     assert left._replace(method="", digest="", cfg=None) == right._replace(
@@ -114,20 +118,22 @@ def test_the_sides_differ_in_the_method_alone(watch, tmp_path):
     )
     with pytest.raises(FileNotFoundError, match=r"none, seed 0 are not in .*study\.py"):
         watch.record(left, task)
-    options, task = watch.read_watch_arguments(
-        ["study=demo", "methods=[caiac,none]", "seeds=1", "task=kettle"]
+    options, task, episode = watch.read_watch_arguments(
+        ["study=demo", "methods=[caiac,none]", "seeds=1", "task=kettle", "episode=3"]
     )
     assert [(r.method, r.seed) for r in watch.pair(options)] == [
         ("caiac", 1),
         ("none", 1),
     ]
-    assert task == "kettle"
-    options, _ = watch.read_watch_arguments(["study=demo", "methods=[none,coda]"])
+    assert (task, episode) == ("kettle", 3)
+    options, *_ = watch.read_watch_arguments(["study=demo", "methods=[none,coda]"])
     with pytest.raises(ValueError, match="no two such runs"):
         watch.pair(options)
     for arguments, message in (
         (["methods=[none,caiac]"], "study=NAME is missing"),
         (["study=demo", "methods=[none]"], "expected two"),
+        (["study=demo", "episode=-1"], "episode is '-1', expected a number from 0"),
+        (["study=demo", "episode="], "episode is '', expected a number"),
     ):
         with pytest.raises(ValueError, match=message):
             watch.read_watch_arguments(arguments)
