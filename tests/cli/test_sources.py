@@ -76,7 +76,7 @@ def test_robomimic(caiac: Caiac, work: Path) -> None:
 
 
 def test_lerobot(caiac: Caiac, work: Path) -> None:
-    version = sorted(path for path in LEROBOT.iterdir() if path.is_dir())[0]
+    version = sorted(path.parent for path in LEROBOT.glob("*/meta"))[0]
     keys = '--option=keys=["observation.state"]'
     found = caiac("inspect", version, keys, "--json")
     assert found.code == 0, found.err
