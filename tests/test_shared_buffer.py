@@ -5,14 +5,15 @@ from __future__ import annotations
 import multiprocessing
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 
 from torchrl_caiac import CAIACTransform, EntityLayout
 from torchrl_caiac.caiac_buffer import CAIACReplayBuffer
@@ -115,6 +116,11 @@ def extended(rb: Any, name: str) -> None:
     assert_right(name, rb.sample(), 1000.0)
 
 
+def grown(rb: ReplayBuffer) -> int:
+    rb.extend(transitions(1000.0))
+    return len(rb)
+
+
 def reseeded(rb: CAIACReplayBuffer) -> tuple[dict[str, Any], list[str]]:
     rb.set_rng(torch.Generator().manual_seed(7))
     return sampled(rb, None)
@@ -143,6 +149,24 @@ def in_process(method: str, *jobs: Callable[[], Any]) -> list[Any]:
         if isinstance(answer, BaseException):
             raise answer
     return found
+
+
+@contextmanager
+def repeated(call: Callable[[], Any]) -> Iterator[None]:
+    """Calls a function again and again in a thread."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.is_set():
+            call()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
@@ -191,22 +215,35 @@ def test_a_forked_process_does_not_wait_for_threads_of_its_parent() -> None:
     building.extend(transitions(0.0, 10**5))
     settings = {**BUFFERS["lookahead"], "donors": "self"}
     rb = make(**settings)
-    ended = threading.Event()
 
     def build() -> None:
-        while not ended.is_set():
-            building.storage.set(0, building.storage[0])
-            building.sample()
+        building.storage.set(0, building.storage[0])
+        building.sample()
 
-    thread = threading.Thread(target=build)
-    thread.start()
-    try:
+    with repeated(build):
         for _ in range(10):
             in_process("fork", partial(extended, rb, "lookahead"))
             rb.extend(transitions(0.0))
-    finally:
-        ended.set()
-        thread.join()
+
+
+def test_a_forked_process_does_not_wait_for_donors_of_its_parents_threads() -> None:
+    donors = ReplayBuffer(storage=LazyTensorStorage(20))
+    donors.extend(transitions(0.0))
+    others = [
+        CAIACReplayBuffer(
+            partial(LazyTensorStorage, 20),
+            augmentation=partial(CAIACTransform, LAYOUT, 0.5, donors=donors),
+            batch_size=256,
+        )
+        for _ in range(2)
+    ]
+    for rb in others:
+        rb.extend(transitions(0.0))
+        rb.sample()
+    with repeated(others[0].sample):
+        for _ in range(10):
+            in_process("fork", partial(sampled, others[1], 0))
+            in_process("fork", partial(grown, donors))
 
 
 def test_a_loaded_state_goes_on_as_the_saved_one() -> None:

@@ -20,6 +20,7 @@ from torchrl.data import (
     ListStorage,
     ReplayBuffer,
     SliceSampler,
+    StorageEnsemble,
     TensorDictReplayBuffer,
     TensorStorage,
 )
@@ -375,6 +376,25 @@ def test_writes_of_other_threads_wait():
             assert len(rb) == 0
         written.result(timeout=10)
     assert len(rb) == 2
+
+
+def test_writes_of_other_processes_wait():
+    rb = ReplayBuffer(storage=LazyMemmapStorage(4), shared=True)
+    rb.extend(rows(2))
+    context = torch.multiprocessing.get_context("fork")
+    with fence.writes_paused(rb), fence.writes_paused(rb):
+        process = context.Process(target=rb.extend, args=(rows(2),))
+        process.start()
+        process.join(1)
+        assert process.is_alive() and len(rb) == 2
+    process.join(30)
+    assert process.exitcode == 0 and len(rb) == 4
+
+
+def test_storages_of_an_ensemble():
+    one, other = LazyTensorStorage(4), LazyTensorStorage(4)
+    assert fence.member_storages(StorageEnsemble(one, other)) == [one, other]
+    assert fence.member_storages(one) == [one]
 
 
 def test_a_loaded_folder_becomes_memory_mapped(tmp_path):

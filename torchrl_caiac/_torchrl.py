@@ -9,21 +9,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
-from tensordict import (
-    TensorDict,
-    TensorDictBase,
-    is_tensor_collection,
-)
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict._utils_key_json import _encode_key_for_filesystem
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import (
     OfflineToOnlineReplayBuffer,
     ReplayBuffer,
+    Storage,
     TensorDictMaxValueWriter,
     TensorStorage,
 )
@@ -46,6 +44,7 @@ __all__ = [
     "leaf_of",
     "loss_masks",
     "mark_memmap",
+    "member_storages",
     "memmap_folder",
     "names_of",
     "packed_linear",
@@ -317,9 +316,25 @@ def sampled_rows() -> tuple[ReplayBuffer, Any, Any] | None:
     return None
 
 
+def member_storages(storage: Storage) -> list[Storage]:
+    """Returns the storages of an ensemble, or the one that is given.
+
+    Examples:
+        >>> from torchrl.data import LazyTensorStorage
+        >>> from torchrl_caiac._torchrl import member_storages
+        >>> len(member_storages(LazyTensorStorage(4)))
+        1
+    """
+    return list(getattr(storage, "_storages", [storage]))
+
+
+# How often writes are paused, within the lock of threads.
+_PAUSED: WeakKeyDictionary[ReplayBuffer, int] = WeakKeyDictionary()
+
+
 @contextmanager
 def writes_paused(source: ReplayBuffer | TensorStorage) -> Iterator[None]:
-    """Has other threads of this process wait before they write through a buffer.
+    """Has other threads, and processes if it is shared, wait to write to a buffer.
 
     Batches may be prefetched by threads, while the main one extends the buffer.
 
@@ -336,7 +351,14 @@ def writes_paused(source: ReplayBuffer | TensorStorage) -> Iterator[None]:
     """
     if isinstance(source, ReplayBuffer):
         with source._replay_lock:
-            yield
+            depth = _PAUSED.get(source, 0)
+            # The lock between processes, unlike that of threads, is not reentrant.
+            with nullcontext() if depth else source._write_lock:
+                _PAUSED[source] = depth + 1
+                try:
+                    yield
+                finally:
+                    _PAUSED[source] = depth
     else:
         yield
 

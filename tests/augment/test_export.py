@@ -174,8 +174,13 @@ def test_what_is_no_state_is_left_out(tmp_path: Path) -> None:
             "action": torch.rand(4, 1),
             "episode": torch.zeros(4, dtype=torch.int64),
             "source": torch.zeros(4, dtype=torch.int64),
+            "goal_index": torch.zeros(4, dtype=torch.int64),
+            "done": torch.zeros(4, 1, dtype=torch.bool),
+            "step_count": torch.zeros(4, 1),
             "next": {
                 "observation": torch.rand(4, 2),
+                "step_count": torch.ones(4, 1),
+                "goal_reached": torch.zeros(4, 1, dtype=torch.bool),
                 "success": torch.zeros(4, 1, dtype=torch.bool),
                 "done": torch.tensor([[False]] * 3 + [[True]]),
                 "terminated": torch.zeros(4, 1, dtype=torch.bool),
@@ -188,6 +193,12 @@ def test_what_is_no_state_is_left_out(tmp_path: Path) -> None:
     assert {*np.load(tmp_path / "a.npz")} == names | {"dones", "terminals"}
     back = open_dataset(tmp_path / "a.npz", tmp_path / "back", progress=False)
     assert back["observation"].shape[-1] == 2
+
+
+def test_states_without_next_ones_are_kept(tmp_path: Path) -> None:
+    rows = TensorDict({"state": torch.rand(4, 2), "action": torch.rand(4, 1)}, [4])
+    with np.load(export_npz(rows, tmp_path / "a.npz"), allow_pickle=False) as stored:
+        assert sorted(stored) == ["actions", "observations/state"]
 
 
 def test_nested_actions_and_goals_of_one_state_are_kept(tmp_path: Path) -> None:

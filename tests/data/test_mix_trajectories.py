@@ -436,8 +436,8 @@ def test_scores_of_other_estimators_are_refused():
         def __call__(self, td):
             return self.scale * td["observation"].abs()
 
-    def scored(scale, seed):
-        data = source([20, 30], seed=seed)
+    def scored(scale, seed, lengths=(20, 30)):
+        data = source(lengths, seed=seed)
         data["observation"] = data["observation", "arm"][:, :2].clone()
         data["next", "observation"] = data["observation"] + 1
         rb = offline_buffer(data, batch_size=8)
@@ -450,6 +450,8 @@ def test_scores_of_other_estimators_are_refused():
     with pytest.raises(ValueError, match=r"0 and source 1 .*exclude=\[\('caiac'"):
         mix_trajectories([one, other], shares=[0.5, 0.5])
     mix_trajectories([one, other], shares=[0.5, 0.5], exclude=["caiac"])
+    with pytest.raises(ValueError, match="source 0 and source 1"):
+        mix_trajectories([scored(1.0, 3, [2]), scored(100.0, 4, [2])])
 
 
 @pytest.mark.parametrize("key", ["state", "nested"])

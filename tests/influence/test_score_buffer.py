@@ -228,6 +228,22 @@ def test_every_is_a_setting_and_resumes(tmp_path):
         score_buffer(rb, Failing(-1), 8, **{**options, "every": 2})
 
 
+def test_every_does_without_next_states_that_data_lack():
+    rows = episodes([5, 8]).exclude(("next", "observation"))
+    rb = filled(rows)
+    score_buffer(rb, Read(), lookahead=0, every=3, progress=False)
+    states = rows["observation"].square()
+    expected = [
+        states[start + k] if k == n - 1 and n % 3 == 0 else states[around].amax(0)
+        for start, n in ((0, 5), (5, 8))
+        for k in range(n)
+        for low in [k - k % 3]
+        for high in [low if k % 3 == 0 else low + 3]
+        for around in [[start + i for i in {low, high} if i < n]]
+    ]
+    torch.testing.assert_close(scores(rb), torch.stack(expected))
+
+
 def test_every_needs_whole_trajectories():
     rb = filled(episodes([11]))
     rb.extend(episodes([3], first_id=1))

@@ -15,6 +15,7 @@ from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
     ReplayBuffer,
+    ReplayBufferEnsemble,
     SliceSampler,
     TensorStorage,
 )
@@ -649,7 +650,39 @@ def test_scores_of_a_layout_that_was_corrected_are_refused(kind, where, tmp_path
         rb = scored(named)
         rb.append_transform(CAIACTransform(layout(columns)))
         rb.sample()
+    right = layout(columns)
+    told = pytest.raises(ValueError, match="'jug', but the layout here says 'cup'")
     rb = scored(exchanged)
-    rb.append_transform(CAIACTransform(layout(columns)))
-    with pytest.raises(ValueError, match="is of 'jug', but the layout here says 'cup'"):
+    rb.append_transform(CAIACTransform(right))
+    with told:
         rb.sample()
+    rb = scored(columns)
+    rb.append_transform(CAIACTransform(right, donors=scored(exchanged)))
+    with told:
+        rb.sample()
+    both = ReplayBufferEnsemble(scored(columns), scored(exchanged), batch_size=16)
+    both.append_transform(CAIACTransform(right))
+    with told:
+        both.sample()
+
+
+def test_records_of_rows_that_were_replaced_say_nothing():
+    columns = {"hand": [0], "cup": [1], "jug": [2]}
+    exchanged = {"hand": [0], "cup": [2], "jug": [1]}
+    state = torch.rand(64, 3)
+    data = {"observation": state, "next": {"observation": state + 0.1}}
+    data["next"]["done"] = torch.ones(64, 1, dtype=torch.bool)
+    data["episode"] = torch.arange(64)
+
+    def scored(named):
+        rb = ReplayBuffer(storage=LazyTensorStorage(64), batch_size=16)
+        rb.extend(TensorDict(data, [64]))
+        estimator = MotionInfluence(EntityLayout(named, fixed=["hand"]), 1.0)
+        score_buffer(rb, estimator, progress=False, check=False)
+        return rb
+
+    rb, right = scored(exchanged), scored(columns).storage[:].clone()
+    rb.empty()
+    rb.extend(right)
+    rb.append_transform(CAIACTransform(EntityLayout(columns, fixed=["hand"])))
+    assert rb.sample()["caiac", "swapped"].any()

@@ -33,6 +33,10 @@ _NAMES = {
     ("caiac", "counterfactual"): "counterfactual",
     ("caiac", "swapped"): "swapped",
 }
+_NO_STATES = (
+    *("action", "caiac", "hindsight", "info", "reward", "done", "terminated"),
+    *("truncated", "step_count", "is_init"),
+)
 
 
 def export_npz(
@@ -167,13 +171,16 @@ def export_hdf5(
 def _arrays(data: TensorDictBase) -> Iterator[tuple[str, torch.Tensor]]:
     """Yields the names and tensors of the entries that have a name there."""
     keys = sorted((path_of(key) for key in data.keys(True, True)), key=str)
+    found = {key: state for key in keys if (state := _state(key))}
+    after = {state for key, state in found.items() if key[0] == "next"}
     # What both states have, goals and observations; the rest tells of a row.
-    both = {key for key in keys if ("next", *key) in keys}
     states = {
         key: state
-        for key in keys
-        if (state := _state(key))
-        and (state in both or state[0] == "observation" or "goal" in state[-1])
+        for key, state in found.items()
+        if not after
+        or (state in found and state in after)
+        or state[0] == "observation"
+        or ("goal" in state[-1] and _is_vector(data.get(key)))
     }
     is_vector = all(state == ("observation",) for state in states.values())
     left_out = []
@@ -195,6 +202,10 @@ def _arrays(data: TensorDictBase) -> Iterator[tuple[str, torch.Tensor]]:
         _LOGGER.info("%s are left out of the exported arrays", left_out)
 
 
+def _is_vector(leaf: torch.Tensor) -> bool:
+    return leaf.ndim > 1 and leaf.dtype is not torch.bool
+
+
 def _is_mark(key: tuple[str, ...]) -> bool:
     return key == ("caiac", "counterfactual")
 
@@ -202,7 +213,7 @@ def _is_mark(key: tuple[str, ...]) -> bool:
 def _state(key: tuple[str, ...]) -> tuple[str, ...] | None:
     """Returns the key of an entry of the state; ``None`` for others."""
     state = key[1:] if key[0] == "next" else key
-    none = key in _NAMES or state[0] in ("action", "caiac", "hindsight", "info")
+    none = key in _NAMES or state[0] in _NO_STATES
     return None if none else state
 
 

@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_caiac._files import reserve
-from torchrl_caiac._fingerprints import settings_of, state_hash
+from torchrl_caiac._fingerprints import fingerprint, state_hash
 from torchrl_caiac._keys import as_key, get_leaf
 from torchrl_caiac._keys import path as key_path
 from torchrl_caiac._torchrl import memmap_folder
@@ -439,9 +439,10 @@ def _settings(source: TensorDictBase, key: tuple[str, ...]) -> int | None:
     for entries in _possible_states(rows):
         state = state_hash(rows, entries)
         after = state_hash(rows, [("next", *entry) for entry in entries])
-        if state is None or after is None or len((state + after).unique()) < 4:
+        if state is None or after is None or len((state + after).unique()) < 2:
             continue  # where all rows are alike, any state seems to be right
-        found = (settings_of(known, state, after) >> 16).unique()
+        # Without the lower 16 bits, which are the surroundings of a row.
+        found = (known.reshape(-1) - fingerprint(state, after, (), 0) >> 16).unique()
         if len(found) == 1:
             return int(found)
     return None

@@ -99,7 +99,8 @@ def score_buffer(
     For a slow estimator, ``every`` reduces the number of states that are scored: only
     :math:`r_0, r_e, r_{2e}, \dots` of each trajectory are computed. A state in between
     gets the larger of the two scores around it, and a state after the last scored one
-    gets the score of that one.
+    gets the score of that one. The last state of a trajectory is the next state of its
+    last row, if the data have next states.
 
     The leaf is float32 ``[T, N]`` (``[T, N + 1, N]`` for graphs), NaN where a row is
     not scored. Beside it, in ``("caiac", "score_fingerprint")`` for the default key,

@@ -7,18 +7,26 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
 
 from torchrl_caiac._files import UnreadableFileError, read_json, write_json
+from torchrl_caiac._fingerprints import (
+    fingerprint_key,
+    is_fingerprint_of,
+    settings_of,
+    state_hash,
+)
 from torchrl_caiac._kernels import check_kernels
 from torchrl_caiac._keys import jsonable, path
-from torchrl_caiac._torchrl import memmap_folder
+from torchrl_caiac._torchrl import leaf_of, memmap_folder
 from torchrl_caiac.entities import EntityLayout
 
 __all__ = [
     "check_owners",
+    "check_scored_layout",
     "layout_digest",
     "read_record",
     "score_file",
@@ -31,6 +39,7 @@ __all__ = [
 _FORMAT = "torchrl_caiac.scores"
 _VERSION = 2
 _STATES = ("new", "scoring", "scored")
+_LOOKED_AT = 64  # rows, evenly spaced
 
 
 def score_file(folder: str | Path, key: NestedKey = ("caiac", "score")) -> Path:
@@ -144,6 +153,48 @@ def write_record(
         storage.caiac_scores = {**records, key: record}
     else:
         write_json(score_file(folder, key), record)
+
+
+def check_scored_layout(
+    storage: TensorStorage, data: TensorDictBase, key: NestedKey, layout: EntityLayout
+) -> None:
+    """Raises if rows have scores of a layout with other owners, by their record.
+
+    A record of scores that no row has any more says nothing.
+
+    Args:
+        storage (TensorStorage): the storage.
+        data (TensorDictBase): its rows.
+        key (NestedKey): the score leaf.
+        layout (EntityLayout): the entities of those who use the scores.
+
+    Raises:
+        ValueError: see :func:`check_owners`.
+    """
+    record = read_record(storage, data, key)
+    if record is not None and not _is_outdated(record, data, key, layout):
+        check_owners(record, layout, key)
+
+
+def _is_outdated(
+    record: dict[str, Any], data: TensorDictBase, key: NestedKey, layout: EntityLayout
+) -> bool:
+    """Returns whether rows have scores, and none of them are those of a record."""
+    known = leaf_of(data, fingerprint_key(key))
+    if known is None:
+        return False
+    count = min(_LOOKED_AT, len(known))
+    rows = torch.arange(count, device=known.device) * len(known) // max(count, 1)
+    some = data[rows]
+    state = state_hash(some, layout.in_keys)
+    after = state_hash(some, [layout.next(name) for name in layout.in_keys])
+    if state is None:
+        return False
+    is_scored = is_fingerprint_of(known[rows], state, after, layout.names)
+    differs = settings_of(known[rows], state, after)
+    differs = differs ^ settings_digest(record["settings"])
+    is_same = differs >> 16 == 0  # the lower bits are the surroundings
+    return bool(is_scored.any() & ~(is_scored & is_same).any())
 
 
 def check_owners(record: dict[str, Any], layout: EntityLayout, key: NestedKey) -> None:

@@ -97,9 +97,13 @@ class Scorer:
     ) -> None:
         state_keys = list(layout.in_keys)
         in_keys = _in_keys(estimator, layout)
-        # Whether the state after the last row of a trajectory is scored.
+        # Whether the state after the last row of a trajectory is scored. Scores of
+        # every few states do without it where the data lack it.
+        after = [layout.next(key) for key in layout.in_keys]
         self._final = reads_state_only(estimator, layout) and (
-            smoothing > 1 or lookahead > 0 or every > 1
+            smoothing > 1
+            or lookahead > 0
+            or (every > 1 and all(data.get(key, None) is not None for key in after))
         )
         layout.check(data[:1], next=self._final)
         self._states = _select(data, in_keys)

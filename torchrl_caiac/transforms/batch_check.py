@@ -22,9 +22,14 @@ from torchrl_caiac._fingerprints import (
 )
 from torchrl_caiac._keys import missing_key
 from torchrl_caiac._sampling import all_finite, is_native
-from torchrl_caiac._torchrl import leaf_of, sampling_buffer, storage_rows
+from torchrl_caiac._torchrl import (
+    leaf_of,
+    member_storages,
+    sampling_buffer,
+    storage_rows,
+)
 from torchrl_caiac.entities import EntityLayout
-from torchrl_caiac.influence.score_record import check_owners, read_record
+from torchrl_caiac.influence.score_record import check_scored_layout
 from torchrl_caiac.trajectories import COLLECTOR_KEY, STEPS_KEY, end_flags
 from torchrl_caiac.transforms.checks import LateCheck, LateValue
 from torchrl_caiac.transforms.keys import TransformKeys
@@ -236,14 +241,12 @@ class BatchCheck:
         """Compares the layout with that of the scores, once for each storage."""
         buffer = sampling_buffer()
         storage = None if buffer is None else buffer.storage
-        if not isinstance(storage, TensorStorage):
+        if storage is None or (self._seen is not None and self._seen() is storage):
             return
-        if self._seen is not None and self._seen() is storage:
-            return
-        data = storage_rows(storage, "the buffer")
-        record = read_record(storage, data, self.score_key)
-        if record is not None:
-            check_owners(record, self.layout, self.score_key)
+        for one in member_storages(storage):
+            if isinstance(one, TensorStorage):
+                data = storage_rows(one, "the buffer")
+                check_scored_layout(one, data, self.score_key, self.layout)
         self._seen = weakref.ref(storage)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from torchrl_caiac._torchrl import (
 )
 from torchrl_caiac.entities import EntityLayout
 from torchrl_caiac.influence.score_leaf import valid_scores
-from torchrl_caiac.influence.score_record import read_record
+from torchrl_caiac.influence.score_record import check_scored_layout, read_record
 from torchrl_caiac.trajectories import TrajectoryIndex, trajectory_index
 from torchrl_caiac.transforms.draws import (
     DonorBits,
@@ -58,7 +58,7 @@ _MOST_LISTED = 1 << 25
 
 @contextmanager
 def unchanged_donors(donors: Sequence[BufferDonors]) -> Iterator[None]:
-    """Has other threads and processes wait before they write to the donors.
+    """Has others wait before they write to the donors.
 
     Donors are drawn by an index of what the storage has, and read afterwards.
 
@@ -323,6 +323,7 @@ class BufferDonors:
                 trajectory_key=self.keys.trajectory,
                 done_key=self.keys.done,
             )
+        check_scored_layout(storage, data, self.score_key, self.layout)
         self._check_estimator(storage, data)
         scores = valid_scores(data, self.score_key, self.layout, len(storage))
         if self.lookahead is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import weakref
 from collections.abc import Callable
@@ -65,6 +66,9 @@ _MOST = torch.iinfo(torch.int16).max - 1
 _CHUNK = 1 << 20
 # Batches may be prefetched by several threads. It is taken before the buffer's lock.
 BUILDING = ThreadLock()
+if hasattr(os, "register_at_fork"):
+    # No thread of a forked process would release the lock of a buffer.
+    os.register_at_fork(before=BUILDING.__enter__, after_in_parent=BUILDING.__exit__)
 
 
 def check_lookahead(lookahead: object) -> LookaheadArgument:
