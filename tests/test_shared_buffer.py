@@ -121,6 +121,12 @@ def grown(rb: ReplayBuffer) -> int:
     return len(rb)
 
 
+def sampled_and_grown(rb: ReplayBuffer) -> None:
+    for _ in range(200):
+        rb.sample()
+        rb.extend(transitions(0.0))
+
+
 def reseeded(rb: CAIACReplayBuffer) -> tuple[dict[str, Any], list[str]]:
     rb.set_rng(torch.Generator().manual_seed(7))
     return sampled(rb, None)
@@ -244,6 +250,29 @@ def test_a_forked_process_does_not_wait_for_donors_of_its_parents_threads() -> N
         for _ in range(10):
             in_process("fork", partial(sampled, others[1], 0))
             in_process("fork", partial(grown, donors))
+
+
+def test_processes_with_the_donors_of_each_other_do_not_wait_for_ever() -> None:
+    buffers = [
+        ReplayBuffer(storage=LazyMemmapStorage(20), batch_size=64, shared=True)
+        for _ in range(2)
+    ]
+    for rb, donors in zip(buffers, reversed(buffers), strict=True):
+        rb.extend(transitions(0.0))
+        donors.extend(transitions(0.0))
+        rb.append_transform(
+            CAIACTransform(LAYOUT, 0.5, donors=donors, lookahead="next")
+        )
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=sampled_and_grown, args=(rb,)) for rb in buffers]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(60)
+    codes = [worker.exitcode for worker in workers]
+    for worker in workers:
+        worker.kill()
+    assert codes == [0, 0]
 
 
 def test_a_loaded_state_goes_on_as_the_saved_one() -> None:

@@ -382,7 +382,7 @@ def test_writes_of_other_processes_wait():
     rb = ReplayBuffer(storage=LazyMemmapStorage(4), shared=True)
     rb.extend(rows(2))
     context = torch.multiprocessing.get_context("fork")
-    with fence.writes_paused(rb), fence.writes_paused(rb):
+    with fence.writes_paused(rb, processes=True), fence.writes_paused(rb):
         process = context.Process(target=rb.extend, args=(rows(2),))
         process.start()
         process.join(1)

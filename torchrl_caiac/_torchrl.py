@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
@@ -328,18 +327,20 @@ def member_storages(storage: Storage) -> list[Storage]:
     return list(getattr(storage, "_storages", [storage]))
 
 
-# How often writes are paused, within the lock of threads.
-_PAUSED: WeakKeyDictionary[ReplayBuffer, int] = WeakKeyDictionary()
-
-
 @contextmanager
-def writes_paused(source: ReplayBuffer | TensorStorage) -> Iterator[None]:
-    """Has other threads, and processes if it is shared, wait to write to a buffer.
+def writes_paused(
+    source: ReplayBuffer | TensorStorage, *, processes: bool = False
+) -> Iterator[None]:
+    """Has others wait before they write through a buffer.
 
     Batches may be prefetched by threads, while the main one extends the buffer.
 
     Args:
         source (ReplayBuffer or TensorStorage): the buffer; a storage has no lock.
+
+    Keyword Args:
+        processes (bool): whether other processes wait too, if the buffer is shared.
+            Unlike that of threads, this lock is not reentrant. Defaults to ``False``.
 
     Examples:
         >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -350,15 +351,9 @@ def writes_paused(source: ReplayBuffer | TensorStorage) -> Iterator[None]:
         0
     """
     if isinstance(source, ReplayBuffer):
-        with source._replay_lock:
-            depth = _PAUSED.get(source, 0)
-            # The lock between processes, unlike that of threads, is not reentrant.
-            with nullcontext() if depth else source._write_lock:
-                _PAUSED[source] = depth + 1
-                try:
-                    yield
-                finally:
-                    _PAUSED[source] = depth
+        others = source._write_lock if processes else nullcontext()
+        with source._replay_lock, others:
+            yield
     else:
         yield
 

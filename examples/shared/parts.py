@@ -12,6 +12,7 @@ from pathlib import Path
 
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
+from omegaconf.errors import ConfigAttributeError
 
 from environments.base import Environment
 from learners.base import Learner
@@ -107,7 +108,10 @@ def check_learner(cfg: DictConfig, method: str, further: int = 0) -> None:
 def _checked(cfg: DictConfig, method: str, further: int = 0) -> Learner:
     check_settings_of("validation", cfg.validation, ValidationSettings)
     learner = new_learner(cfg, method)
-    learner.environment.check()
+    try:
+        learner.environment.check()
+    except ConfigAttributeError as error:
+        raise ValueError(f"{error.full_key} is missing") from error
     learner.check(further)
     return learner
 

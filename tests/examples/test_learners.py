@@ -516,6 +516,7 @@ def test_policies_to_validate(configure, steps):
         ),
         ("fetch_push", "bc", "env.evaluate=3", "env.evaluate is 3, .* a group"),
         ("kitchen", "bc", "env.evaluate.seed=null", "integer of at least 0"),
+        ("kitchen", "bc", "~env.evaluate.seed", "env.evaluate.seed is missing"),
         ("fetch_push", "bc", "env.augmentation.threshold=auto", "threshold is 'auto'"),
     ],
 )

@@ -682,6 +682,11 @@ def test_records_of_rows_that_were_replaced_say_nothing():
         return rb
 
     rb, right = scored(exchanged), scored(columns).storage[:].clone()
+    late = scored(exchanged)
+    late.extend(right[:63])  # one row is left
+    late.append_transform(CAIACTransform(EntityLayout(columns, fixed=["hand"])))
+    with pytest.raises(ValueError, match="'jug', but the layout here says 'cup'"):
+        late.sample()
     rb.empty()
     rb.extend(right)
     rb.append_transform(CAIACTransform(EntityLayout(columns, fixed=["hand"])))

@@ -33,9 +33,20 @@ _NAMES = {
     ("caiac", "counterfactual"): "counterfactual",
     ("caiac", "swapped"): "swapped",
 }
-_NO_STATES = (
-    *("action", "caiac", "hindsight", "info", "reward", "done", "terminated"),
-    *("truncated", "step_count", "is_init"),
+# What tells of a row, in data of this package and of TorchRL.
+_NO_STATES = frozenset(
+    {
+        "action",
+        "caiac",
+        "done",
+        "hindsight",
+        "info",
+        "is_init",
+        "reward",
+        "step_count",
+        "terminated",
+        "truncated",
+    }
 )
 
 
@@ -173,12 +184,13 @@ def _arrays(data: TensorDictBase) -> Iterator[tuple[str, torch.Tensor]]:
     keys = sorted((path_of(key) for key in data.keys(True, True)), key=str)
     found = {key: state for key in keys if (state := _state(key))}
     after = {state for key, state in found.items() if key[0] == "next"}
-    # What both states have, goals and observations; the rest tells of a row.
+    # What both states have, goals and observations; the rest tells of a row. Data
+    # without next states do not tell.
     states = {
         key: state
         for key, state in found.items()
         if not after
-        or (state in found and state in after)
+        or (state in after and state in found)
         or state[0] == "observation"
         or ("goal" in state[-1] and _is_vector(data.get(key)))
     }

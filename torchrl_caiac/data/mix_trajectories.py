@@ -442,7 +442,8 @@ def _settings(source: TensorDictBase, key: tuple[str, ...]) -> int | None:
         if state is None or after is None or len((state + after).unique()) < 2:
             continue  # where all rows are alike, any state seems to be right
         # Without the lower 16 bits, which are the surroundings of a row.
-        found = (known.reshape(-1) - fingerprint(state, after, (), 0) >> 16).unique()
+        rest = known.reshape(-1) - fingerprint(state, after, (), 0)
+        found = (rest >> 16).unique()
         if len(found) == 1:
             return int(found)
     return None

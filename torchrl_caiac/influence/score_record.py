@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import TensorStorage
@@ -39,7 +38,7 @@ __all__ = [
 _FORMAT = "torchrl_caiac.scores"
 _VERSION = 2
 _STATES = ("new", "scoring", "scored")
-_LOOKED_AT = 64  # rows, evenly spaced
+_ROWS = 1 << 16  # that are read together
 
 
 def score_file(folder: str | Path, key: NestedKey = ("caiac", "score")) -> Path:
@@ -172,29 +171,38 @@ def check_scored_layout(
         ValueError: see :func:`check_owners`.
     """
     record = read_record(storage, data, key)
-    if record is not None and not _is_outdated(record, data, key, layout):
+    if record is None:
+        return
+    try:
         check_owners(record, layout, key)
+    except ValueError:
+        if not _is_outdated(record, data, key, layout):
+            raise
 
 
 def _is_outdated(
     record: dict[str, Any], data: TensorDictBase, key: NestedKey, layout: EntityLayout
 ) -> bool:
     """Returns whether rows have scores, and none of them are those of a record."""
-    known = leaf_of(data, fingerprint_key(key))
-    if known is None:
+    fingerprints = leaf_of(data, fingerprint_key(key))
+    if fingerprints is None:
         return False
-    count = min(_LOOKED_AT, len(known))
-    rows = torch.arange(count, device=known.device) * len(known) // max(count, 1)
-    some = data[rows]
-    state = state_hash(some, layout.in_keys)
-    after = state_hash(some, [layout.next(name) for name in layout.in_keys])
-    if state is None:
-        return False
-    is_scored = is_fingerprint_of(known[rows], state, after, layout.names)
-    differs = settings_of(known[rows], state, after)
-    differs = differs ^ settings_digest(record["settings"])
-    is_same = differs >> 16 == 0  # the lower bits are the surroundings
-    return bool(is_scored.any() & ~(is_scored & is_same).any())
+    keys = list(layout.in_keys)
+    next_keys = [layout.next(name) for name in keys]
+    states = data.select(*keys, *next_keys, strict=False)
+    wanted = settings_digest(record["settings"])
+    has_scores = False
+    for part, known in zip(states.split(_ROWS), fingerprints.split(_ROWS), strict=True):
+        state, after = state_hash(part, keys), state_hash(part, next_keys)
+        if state is None:
+            return False
+        is_scored = is_fingerprint_of(known, state, after, layout.names)
+        differs = settings_of(known, state, after) ^ wanted
+        # The lower 16 bits are the surroundings of a row.
+        if (is_scored & (differs >> 16 == 0)).any():
+            return False
+        has_scores = has_scores or bool(is_scored.any())
+    return has_scores
 
 
 def check_owners(record: dict[str, Any], layout: EntityLayout, key: NestedKey) -> None:

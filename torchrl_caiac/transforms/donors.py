@@ -73,8 +73,9 @@ def unchanged_donors(donors: Sequence[BufferDonors]) -> Iterator[None]:
     if not donors or torch.compiler.is_compiling():
         yield
         return
-    # Always in this order, in which the lookahead takes them too.
-    with BUILDING, writes_paused(donors[0].donors):
+    # Always in this order, in which the lookahead takes them too. That has processes
+    # wait for no other buffer, since two may be the donors of each other.
+    with BUILDING, writes_paused(donors[0].donors, processes=True):
         yield
 
 
