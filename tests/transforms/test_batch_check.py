@@ -666,28 +666,44 @@ def test_scores_of_a_layout_that_was_corrected_are_refused(kind, where, tmp_path
         both.sample()
 
 
-def test_records_of_rows_that_were_replaced_say_nothing():
-    columns = {"hand": [0], "cup": [1], "jug": [2]}
-    exchanged = {"hand": [0], "cup": [2], "jug": [1]}
+COLUMNS = {"hand": [0], "cup": [1], "jug": [2]}
+EXCHANGED = {"hand": [0], "cup": [2], "jug": [1]}
+
+
+def scored_by(named):
+    """A buffer of 64 rows, scored by a layout with these columns."""
+    torch.manual_seed(0)
     state = torch.rand(64, 3)
     data = {"observation": state, "next": {"observation": state + 0.1}}
     data["next"]["done"] = torch.ones(64, 1, dtype=torch.bool)
     data["episode"] = torch.arange(64)
+    rb = ReplayBuffer(storage=LazyTensorStorage(64), batch_size=16)
+    rb.extend(TensorDict(data, [64]))
+    estimator = MotionInfluence(EntityLayout(named, fixed=["hand"]), 1.0)
+    score_buffer(rb, estimator, progress=False, check=False)
+    return rb
 
-    def scored(named):
-        rb = ReplayBuffer(storage=LazyTensorStorage(64), batch_size=16)
-        rb.extend(TensorDict(data, [64]))
-        estimator = MotionInfluence(EntityLayout(named, fixed=["hand"]), 1.0)
-        score_buffer(rb, estimator, progress=False, check=False)
-        return rb
 
-    rb, right = scored(exchanged), scored(columns).storage[:].clone()
-    late = scored(exchanged)
+def test_a_member_without_rows_is_compared_when_it_has_some():
+    empty = ReplayBuffer(storage=LazyTensorStorage(64), batch_size=8)
+    both = ReplayBufferEnsemble(scored_by(COLUMNS), empty, batch_size=16, p=[1.0, 0.0])
+    both.append_transform(CAIACTransform(EntityLayout(COLUMNS, fixed=["hand"])))
+    assert both.sample()["caiac", "swapped"].any()
+    empty.extend(scored_by(EXCHANGED).storage[:])  # without a record
+    estimator = MotionInfluence(EntityLayout(EXCHANGED, fixed=["hand"]), 1.0)
+    score_buffer(empty, estimator, progress=False, check=False, overwrite=True)
+    with pytest.raises(ValueError, match="'jug', but the layout here says 'cup'"):
+        both.sample()
+
+
+def test_records_of_rows_that_were_replaced_say_nothing():
+    rb, right = scored_by(EXCHANGED), scored_by(COLUMNS).storage[:].clone()
+    late = scored_by(EXCHANGED)
     late.extend(right[:63])  # one row is left
-    late.append_transform(CAIACTransform(EntityLayout(columns, fixed=["hand"])))
+    late.append_transform(CAIACTransform(EntityLayout(COLUMNS, fixed=["hand"])))
     with pytest.raises(ValueError, match="'jug', but the layout here says 'cup'"):
         late.sample()
     rb.empty()
     rb.extend(right)
-    rb.append_transform(CAIACTransform(EntityLayout(columns, fixed=["hand"])))
+    rb.append_transform(CAIACTransform(EntityLayout(COLUMNS, fixed=["hand"])))
     assert rb.sample()["caiac", "swapped"].any()

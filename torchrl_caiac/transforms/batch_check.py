@@ -243,11 +243,13 @@ class BatchCheck:
         storage = None if buffer is None else buffer.storage
         if storage is None or (self._seen is not None and self._seen() is storage):
             return
-        for one in member_storages(storage):
-            if isinstance(one, TensorStorage):
+        members = member_storages(storage)
+        for one in members:
+            if isinstance(one, TensorStorage) and len(one):
                 data = storage_rows(one, "the buffer")
                 check_scored_layout(one, data, self.score_key, self.layout)
-        self._seen = weakref.ref(storage)
+        if all(map(len, members)):  # an empty one is compared when it has rows
+            self._seen = weakref.ref(storage)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_seen": None}
