@@ -159,7 +159,11 @@ def in_process(method: str, *jobs: Callable[[], Any]) -> list[Any]:
 
 @contextmanager
 def repeated(call: Callable[[], Any]) -> Iterator[None]:
-    """Calls a function again and again in a thread."""
+    """Calls a function again and again in a thread.
+
+    It must not draw from torch's default generator, whose lock a process that is forked
+    meanwhile may inherit. Nothing releases it there.
+    """
     ended = threading.Event()
 
     def run() -> None:
@@ -216,7 +220,7 @@ def test_threads_of_a_buffer_are_those_of_its_process(method: str) -> None:
 
 def test_a_forked_process_does_not_wait_for_threads_of_its_parent() -> None:
     building = CAIACReplayBuffer(
-        partial(LazyTensorStorage, 10**5), augmentation=AHEAD, batch_size=4
+        partial(LazyTensorStorage, 10**5), augmentation=AHEAD, batch_size=4, seed=0
     )
     building.extend(transitions(0.0, 10**5))
     settings = {**BUFFERS["lookahead"], "donors": "self"}
@@ -240,8 +244,9 @@ def test_a_forked_process_does_not_wait_for_donors_of_its_parents_threads() -> N
             partial(LazyTensorStorage, 20),
             augmentation=partial(CAIACTransform, LAYOUT, 0.5, donors=donors),
             batch_size=256,
+            seed=seed,
         )
-        for _ in range(2)
+        for seed in range(2)
     ]
     for rb in others:
         rb.extend(transitions(0.0))
