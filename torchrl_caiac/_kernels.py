@@ -302,12 +302,31 @@ def machine() -> dict[str, Any]:
         ['processor', 'units', 'torch', 'threads']
     """
     capabilities = torch.cpu.get_capabilities()
+    names = [str(capabilities.get("cpu_name", "unknown")), *_generation()]
     return {
-        "processor": str(capabilities.get("cpu_name", "unknown")),
+        "processor": ", ".join(names),
         "units": sorted(name for name, has in capabilities.items() if has is True),
         "torch": torch.__version__,
         "threads": torch.get_num_threads(),
     }
+
+
+@cache
+def _generation() -> list[str]:
+    """Returns family and model, since virtual machines give many the same name."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # another system
+        return []
+    found = [
+        re.search(rf"^{label}\s*: (\d+)$", text, re.MULTILINE)
+        for label in ("cpu family", "model")
+    ]
+    return [
+        f"{name} {match[1]}"
+        for name, match in zip(("family", "model"), found, strict=True)
+        if match
+    ]
 
 
 def processor_slug(name: str) -> str:
