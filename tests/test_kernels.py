@@ -89,6 +89,12 @@ def test_the_fastest_is_chosen_by_a_margin(timed, times, want):
     assert choose("8x8x8", default, refuse) == want
 
 
+def test_processors_of_one_name_are_told_apart():
+    text = Path("/proc/cpuinfo").read_text()
+    own = machine()["processor"]
+    assert ("family" in own) == ("cpu family" in text)
+
+
 def test_another_process_reads_what_one_has_measured(timed, cache, monkeypatch):
     choose("8x8x8", "plain", timed(plain=1.0, onednn=0.5))
     choose("9x9x9", "plain", timed(plain=1.0, onednn=1.0))

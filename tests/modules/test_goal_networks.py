@@ -174,11 +174,13 @@ def test_normalised_layers(dtype, batch):
     got = pair[0](td.clone())["state_action_value"]
     torch.testing.assert_close(got, wants[0], **tolerance)
     stacked = torch.stack([TensorDict.from_module(x).data for x in pair])
-    got = pair[0](td.expand(2, *batch), stacked)["state_action_value"]
-    torch.testing.assert_close(got, torch.stack(wants), **tolerance)
-    with mock.patch.object(networks_module, "_on_cpu", return_value=False):
-        got = pair[0](td.expand(2, *batch), stacked)["state_action_value"]
-    torch.testing.assert_close(got, torch.stack(wants), **tolerance)
+    for on_cpu in (True, False):
+        with mock.patch.object(networks_module, "_on_cpu", return_value=on_cpu):
+            for inputs in (td.expand(2, *batch), td.unsqueeze(0)):
+                got = pair[0](inputs, stacked)
+                assert got.batch_size == (2, *batch)
+                got = got["state_action_value"]
+                torch.testing.assert_close(got, torch.stack(wants), **tolerance)
 
 
 def test_who_takes_parameters():

@@ -191,10 +191,11 @@ class GoalFeatures(TensorDictModuleBase):
             goal (torch.Tensor): ``[*B, G]``.
             params (TensorDictBase, optional): buffers to use instead of the module's
                 own. Those of ``C`` modules may be stacked; ``*B`` then begins with
-                ``C``. Defaults to the module's own.
+                ``C``, or with 1 for one input of all. Defaults to the module's own.
 
         Returns:
-            torch.Tensor: ``[*B, F]``, in the dtype of the statistics.
+            torch.Tensor: ``[*B, F]``, in the dtype of the statistics; ``[C, ..., F]``
+            for one input of all.
 
         Raises:
             ValueError: a tensor has the wrong width.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 
 import torch
@@ -49,20 +49,45 @@ class _CastLinear(nn.Linear):
     def forward(
         self, value: torch.Tensor, params: TensorDictBase | None = None
     ) -> torch.Tensor:
-        own = (self.weight, self.bias)
-        pair = own if params is None else (params.get("weight"), params.get("bias"))
-        dtype = self.compute_dtype or pair[0].dtype
-        if dtype is torch.bfloat16 and _on_cpu(value):
-            _warn_without_bfloat16()
-        value, weight, bias = (x.to(dtype) for x in (value, *pair))
+        weight, bias = self._cast_weights(params)
+        value = value.to(weight.dtype)
         if weight.ndim == 2:
-            if not self.layer_norm:
-                return linear(value, weight, bias, self.relu)
-            out = linear(value, weight, bias)
-        else:
-            rows = value.reshape(len(weight), -1, value.shape[-1])
-            out = torch.baddbmm(bias.unsqueeze(-2), rows, weight.mT)
-            out = out.reshape(*value.shape[:-1], -1)
+            return self._apply_one(value, weight, bias)
+        rows = value.reshape(len(weight), -1, value.shape[-1])
+        out = torch.baddbmm(bias.unsqueeze(-2), rows, weight.mT)
+        return self._activate(out.reshape(*value.shape[:-1], -1))
+
+    def each(
+        self, values: Iterable[torch.Tensor], params: TensorDictBase
+    ) -> list[torch.Tensor]:
+        """Applies stacked layers one after the other, each to its own input."""
+        # Cast before they are unbound: gradients are then stacked in the smaller dtype.
+        weights, biases = self._cast_weights(params)
+        layers = zip(values, weights.unbind(0), biases.unbind(0), strict=True)
+        return [
+            self._apply_one(value.to(weight.dtype), weight, bias)
+            for value, weight, bias in layers
+        ]
+
+    def _cast_weights(
+        self, params: TensorDictBase | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = self.weight, self.bias
+        if params is not None:
+            weight, bias = params.get("weight"), params.get("bias")
+        dtype = self.compute_dtype or weight.dtype
+        if dtype is torch.bfloat16 and _on_cpu(weight):
+            _warn_without_bfloat16()
+        return weight.to(dtype), bias.to(dtype)
+
+    def _apply_one(
+        self, value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
+    ) -> torch.Tensor:
+        if not self.layer_norm:
+            return linear(value, weight, bias, self.relu)
+        return self._activate(linear(value, weight, bias))
+
+    def _activate(self, out: torch.Tensor) -> torch.Tensor:
         if self.layer_norm:
             out = nn.functional.layer_norm(out, out.shape[-1:])
         return out.relu() if self.relu else out
@@ -81,13 +106,19 @@ class _MLP(MLP):
     def forward(
         self, value: torch.Tensor, params: TensorDictBase | None = None
     ) -> torch.Tensor:
+        layers = [
+            (layer, None if params is None else params.get(name))
+            for name, layer in self.named_children()
+            if isinstance(layer, _CastLinear)
+        ]
         if params is not None and params.batch_dims and _on_cpu(value):
             # Batched products are no faster on a CPU, and slower in float32.
-            networks = zip(value, params.unbind(0), strict=True)
-            return torch.stack([self(one, own) for one, own in networks])
-        for name, layer in self.named_children():
-            if isinstance(layer, _CastLinear):
-                value = layer(value, None if params is None else params.get(name))
+            values = list(value.unbind(0))
+            for layer, own in layers:
+                values = layer.each(values, own)
+            return torch.stack(values)
+        for layer, own in layers:
+            value = layer(value, own)
         return value
 
 
@@ -350,10 +381,12 @@ class GoalConditionedCritic(TensorDictModuleBase):
                 actions ``[*B, A]``.
             params (TensorDictBase, optional): parameters and buffers to use instead
                 of the module's own, such as those of ``C`` critics, stacked by a loss;
-                ``*B`` then begins with ``C``. Defaults to the module's own.
+                ``*B`` then begins with ``C``, or with 1 for one input of all. Defaults
+                to the module's own.
 
         Returns:
-            TensorDictBase: the same tensordict, with the value ``[*B, 1]``.
+            TensorDictBase: the same tensordict, with the value ``[*B, 1]``; for one
+            input of all, the same expanded to ``C``.
 
         Raises:
             KeyError: an input is missing.
@@ -365,8 +398,12 @@ class GoalConditionedCritic(TensorDictModuleBase):
             for name in ("features", "network")
         )
         features = self.features.forward_tensors(observation, goal, of_features)
-        inputs = torch.cat([features, action.to(features.dtype)], -1)
-        return tensordict.set(self.out_keys[0], self.network(inputs, of_network))
+        action = action.to(features.dtype).expand(*features.shape[:-1], -1)
+        value = self.network(torch.cat([features, action], -1), of_network)
+        is_shared = params is not None and bool(params.batch_dims)
+        if is_shared and tensordict.batch_size[0] == 1:
+            tensordict = tensordict.expand(value.shape[:-1])
+        return tensordict.set(self.out_keys[0], value)
 
 
 class GoalConditionedValue(TensorDictModuleBase):

@@ -394,8 +394,7 @@ class GoalConditionedTD3Loss(TD3Loss):
     def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> torch.Tensor:
         """Returns the values of all critics, ``[C, *B]``."""
         if takes_params(self.qvalue_network):
-            inputs = inputs.expand(self.num_qvalue_nets, *inputs.batch_size)
-            out = self.qvalue_network(inputs, params)
+            out = self.qvalue_network(inputs.unsqueeze(0), params)
         else:
             out = self._vmap_qvalue_networkN0(inputs, params)
         value: torch.Tensor = out.get(self.tensor_keys.state_action_value)
