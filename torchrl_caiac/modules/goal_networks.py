@@ -398,11 +398,15 @@ class GoalConditionedCritic(TensorDictModuleBase):
             for name in ("features", "network")
         )
         features = self.features.forward_tensors(observation, goal, of_features)
-        action = action.to(features.dtype).expand(*features.shape[:-1], -1)
+        action = action.to(features.dtype)
+        if (
+            params is not None
+            and params.batch_dims
+            and tensordict.batch_size[0] == 1  # one input for all
+        ):
+            tensordict = tensordict.expand(len(params), *tensordict.batch_size[1:])
+            action = action.expand(len(params), *action.shape[1:])
         value = self.network(torch.cat([features, action], -1), of_network)
-        is_shared = params is not None and bool(params.batch_dims)
-        if is_shared and tensordict.batch_size[0] == 1:
-            tensordict = tensordict.expand(value.shape[:-1])
         return tensordict.set(self.out_keys[0], value)
 
 
