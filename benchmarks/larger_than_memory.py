@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import resource
 import shutil
 import subprocess
@@ -36,6 +35,7 @@ from torchrl_caiac import (
     EntityLayout,
     check_dataset,
 )
+from torchrl_caiac._kernels import machine
 from torchrl_caiac.data import TransitionWriter, load_transitions, open_dataset
 from torchrl_caiac.data.select_successful import select_successful
 from torchrl_caiac.influence import (
@@ -288,7 +288,7 @@ def main() -> None:
     head = f"{'step':34s} {'seconds':>10s} {'peak MiB':>9s} {'added MiB':>9s} B/row"
     lines = [
         f"{args.rows:,} rows, {args.limit} MiB of anonymous memory (RLIMIT_DATA), one "
-        f"thread, {os.cpu_count()} x {processor()}, torch {torch.__version__}",
+        f"thread, {os.cpu_count()} x {machine()['processor']}, torch {torch.__version__}",
         head,
     ]
     print("\n".join(lines), flush=True)
@@ -310,14 +310,6 @@ def main() -> None:
     finally:
         shutil.rmtree(work, ignore_errors=True)
     args.result.write_text("\n".join(lines) + "\n")
-
-
-def processor() -> str:
-    """Returns the name of the CPU."""
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            return line.split(":")[1].strip()
-    return platform.machine()
 
 
 if __name__ == "__main__":
