@@ -288,7 +288,8 @@ def main() -> None:
     head = f"{'step':34s} {'seconds':>10s} {'peak MiB':>9s} {'added MiB':>9s} B/row"
     lines = [
         f"{args.rows:,} rows, {args.limit} MiB of anonymous memory (RLIMIT_DATA), one "
-        f"thread, {os.cpu_count()} x {machine()['processor']}, torch {torch.__version__}",
+        f"thread, {os.cpu_count()} x {machine()['processor']}, "
+        f"torch {torch.__version__}",
         head,
     ]
     print("\n".join(lines), flush=True)

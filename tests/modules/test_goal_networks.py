@@ -181,6 +181,15 @@ def test_normalised_layers(dtype, batch):
                 assert got.batch_size == (2, *batch)
                 got = got["state_action_value"]
                 torch.testing.assert_close(got, torch.stack(wants), **tolerance)
+            # Rows that are no batch dimensions, and a single critic.
+            for params, inputs in ((stacked, td.expand(2, *batch)), (stacked[:1], td)):
+                inputs = inputs.reshape(len(params), *batch).clone()
+                inputs.batch_size = []
+                got = pair[0](inputs, params)
+                assert got is inputs
+                want = torch.stack(wants[: len(params)])
+                got = got["state_action_value"]
+                torch.testing.assert_close(got, want, **tolerance)
 
 
 def test_who_takes_parameters():

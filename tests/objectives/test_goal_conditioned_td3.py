@@ -672,6 +672,16 @@ def test_action_spec_bounds_the_smoothed_action():
     assert torch.equal(of_critics, batch["action"].unsqueeze(0))
 
 
+def test_layers_of_critics_call_their_hooks():
+    loss, batch, calls = make_loss(), make_batch(5), []
+    layer = loss.qvalue_network.network[0]
+    layer.register_forward_hook(lambda *args: calls.append(args))
+    loss.value_loss(batch)
+    assert len(calls) == 4  # two critics, of values and of targets
+    loss.actor_loss(batch)
+    assert len(calls) == 5
+
+
 @pytest.mark.parametrize("which", ["value_loss", "actor_loss"])
 def test_actions_outside_of_their_bounds_are_refused(which):
     batch = make_batch(50)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 
 import torch
@@ -47,47 +47,25 @@ class _CastLinear(nn.Linear):
         self.layer_norm = layer_norm
 
     def forward(
-        self, value: torch.Tensor, params: TensorDictBase | None = None
+        self,
+        value: torch.Tensor,
+        weight: torch.Tensor | None = None,
+        bias: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        weight, bias = self._cast_weights(params)
-        value = value.to(weight.dtype)
-        if weight.ndim == 2:
-            return self._apply_one(value, weight, bias)
-        rows = value.reshape(len(weight), -1, value.shape[-1])
-        out = torch.baddbmm(bias.unsqueeze(-2), rows, weight.mT)
-        return self._activate(out.reshape(*value.shape[:-1], -1))
-
-    def each(
-        self, values: Iterable[torch.Tensor], params: TensorDictBase
-    ) -> list[torch.Tensor]:
-        """Applies stacked layers one after the other, each to its own input."""
-        # Cast before they are unbound: gradients are then stacked in the smaller dtype.
-        weights, biases = self._cast_weights(params)
-        layers = zip(values, weights.unbind(0), biases.unbind(0), strict=True)
-        return [
-            self._apply_one(value.to(weight.dtype), weight, bias)
-            for value, weight, bias in layers
-        ]
-
-    def _cast_weights(
-        self, params: TensorDictBase | None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        weight, bias = self.weight, self.bias
-        if params is not None:
-            weight, bias = params.get("weight"), params.get("bias")
+        weight = self.weight if weight is None else weight
+        bias = self.bias if bias is None else bias
         dtype = self.compute_dtype or weight.dtype
-        if dtype is torch.bfloat16 and _on_cpu(weight):
+        if dtype is torch.bfloat16 and _on_cpu(value):
             _warn_without_bfloat16()
-        return weight.to(dtype), bias.to(dtype)
-
-    def _apply_one(
-        self, value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
-    ) -> torch.Tensor:
-        if not self.layer_norm:
-            return linear(value, weight, bias, self.relu)
-        return self._activate(linear(value, weight, bias))
-
-    def _activate(self, out: torch.Tensor) -> torch.Tensor:
+        value, weight, bias = (x.to(dtype) for x in (value, weight, bias))
+        if weight.ndim == 2:
+            if not self.layer_norm:
+                return linear(value, weight, bias, self.relu)
+            out = linear(value, weight, bias)
+        else:
+            rows = value.reshape(len(weight), -1, value.shape[-1])
+            out = torch.baddbmm(bias.unsqueeze(-2), rows, weight.mT)
+            out = out.reshape(*value.shape[:-1], -1)
         if self.layer_norm:
             out = nn.functional.layer_norm(out, out.shape[-1:])
         return out.relu() if self.relu else out
@@ -106,20 +84,27 @@ class _MLP(MLP):
     def forward(
         self, value: torch.Tensor, params: TensorDictBase | None = None
     ) -> torch.Tensor:
-        layers = [
-            (layer, None if params is None else params.get(name))
+        layers: list[tuple[_CastLinear, list[torch.Tensor]]] = [
+            (
+                layer,
+                []
+                if params is None
+                else [params.get((name, key)) for key in ("weight", "bias")],
+            )
             for name, layer in self.named_children()
             if isinstance(layer, _CastLinear)
         ]
-        if params is not None and params.batch_dims and _on_cpu(value):
-            # Batched products are no faster on a CPU, and slower in float32.
-            values = list(value.unbind(0))
+        if params is None or not params.batch_dims or not _on_cpu(value):
             for layer, own in layers:
-                values = layer.each(values, own)
-            return torch.stack(values)
+                value = layer(value, *own)
+            return value
+        # Batched products are no faster on a CPU, and slower in float32.
+        values = list(value.unbind(0))
         for layer, own in layers:
-            value = layer(value, own)
-        return value
+            # Cast before they are unbound: gradients are stacked in the smaller dtype.
+            cast = [x.to(layer.compute_dtype or x.dtype).unbind(0) for x in own]
+            values = [layer(*one) for one in zip(values, *cast, strict=True)]
+        return torch.stack(values)
 
 
 def _on_cpu(value: torch.Tensor) -> bool:
@@ -399,13 +384,12 @@ class GoalConditionedCritic(TensorDictModuleBase):
         )
         features = self.features.forward_tensors(observation, goal, of_features)
         action = action.to(features.dtype)
-        if (
-            params is not None
-            and params.batch_dims
-            and tensordict.batch_size[0] == 1  # one input for all
-        ):
-            tensordict = tensordict.expand(len(params), *tensordict.batch_size[1:])
-            action = action.expand(len(params), *action.shape[1:])
+        count = len(params) if params is not None and params.batch_dims else 1
+        if count > 1 and tensordict.batch_size[:1] == (1,):  # one input for all
+            tensordict = tensordict.expand(count, *tensordict.batch_size[1:])
+            features, action = (
+                x.expand(count, *x.shape[1:]) for x in (features, action)
+            )
         value = self.network(torch.cat([features, action], -1), of_network)
         return tensordict.set(self.out_keys[0], value)
 
